@@ -43,6 +43,8 @@ STALL_S: Final = 3.0
 LEAD_S: Final = 0.5  # from the beginning of an interval to the stall
 #: Shortest interval with a stall: the lead, the stall, and a second to recover.
 SHORTEST_STALL_S: Final = LEAD_S + STALL_S + 1.0
+#: Kind of intervals in which nothing is disturbed.
+BASELINE: Final = "baseline"
 #: A frame is fresh if it is at most this much older than the median of the client before the stall.
 FRESH_MS: Final = 20.0
 
@@ -161,7 +163,7 @@ class _Reading(NamedTuple):
 
 
 class Usage(NamedTuple):
-    """What a session used of the machine in a window.
+    """Use of the machine by a session in a window.
 
     `cpu_shares`: of one core, of `server` (authority and front), `recorder` and `gateway`, where they ran at both ends;
     `rss`: their memory at both ends [bytes]. `late_causes`: late ticks of the last ten seconds by cause.

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import (
+    BASELINE,
     CLIENTS_PER_PROCESS,
     SHORTEST_STALL_S,
     STALL_S,
@@ -28,7 +29,7 @@ from iris_session.bench.report import BenchReport, allow_increase, make_bar
 from iris_session.demo.scenes import free_bodies_scene
 
 ROUNDS: Final = 3
-STOPPED, STALLED, BASELINE = "stopped", "stalled", "baseline"
+STOPPED, STALLED = "stopped", "stalled"
 #: IRIS SimPublisher 2.2 on a machine of this kind, plain: DESIGN of the project, measured.
 REFERENCE: Final = {"resume_first_age_ms": 2980.0, "resume_fresh_after_ms": 4400.0}
 

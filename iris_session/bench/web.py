@@ -15,6 +15,7 @@ import numpy as np
 
 from iris_session.bench.clients import BROWSERS, TABS, ClientJob
 from iris_session.bench.harness import (
+    BASELINE,
     SHORTEST_STALL_S,
     Interval,
     Log,
@@ -37,7 +38,6 @@ from iris_session.bench.report import (
     make_bar,
     summarize_percentiles,
 )
-from iris_session.bench.slow_client import BASELINE
 from iris_session.bench.web_tab import STOPS_S, MissingToolError, find_tools
 from iris_session.demo.scenes.aloha import aloha_scene
 from iris_session.system.extras import require_package

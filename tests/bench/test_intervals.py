@@ -9,6 +9,7 @@ import pytest
 
 from iris_session.bench.cloud_stream import plan_stream
 from iris_session.bench.harness import (
+    BASELINE,
     SHORTEST_STALL_S,
     Interval,
     compute_age_p99_ms,
@@ -17,7 +18,7 @@ from iris_session.bench.harness import (
     summarize_runs,
     summarize_stalls,
 )
-from iris_session.bench.slow_client import BASELINE, STALLED, STOPPED
+from iris_session.bench.slow_client import STALLED, STOPPED
 from iris_session.bench.web import FROZEN, LENGTHS_S, LOADING
 
 MS = 1_000_000
