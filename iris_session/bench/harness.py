@@ -11,7 +11,6 @@ import hashlib
 import os
 import signal
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, groupby
@@ -152,16 +151,6 @@ def _group_clients(clients: Sequence[ClientJob]) -> list[list[ClientJob]]:
     return groups
 
 
-class _Reading(NamedTuple):
-    """Statistics of ticks and of processes at one time."""
-
-    at_s: float
-    stats: PacerStats
-    late_causes: dict[str, int]
-    cpu_s: dict[str, float]
-    rss: dict[str, int]
-
-
 class Usage(NamedTuple):
     """Use of the machine by a session in a window.
 
@@ -175,35 +164,40 @@ class Usage(NamedTuple):
     rss: dict[str, tuple[int, int]]
 
 
+#: Ticks, and by process its processor time [s] and memory [bytes], at one time.
+_Reading = tuple[PacerStats | None, dict[str, tuple[float, int]]]
+
+
 def _read_usage(session: Session, *, anew: bool) -> _Reading:
     processes = session.processes
-    page = processes.web
     pids = {
         "server": (os.getpid(), processes.front_pid),
         "recorder": (processes.recorder_pid,),
-        "gateway": (0 if page is None else page.pid,),
+        "gateway": (0 if processes.web is None else processes.web.pid,),
     }
-    found = {name: [psutil.Process(pid) for pid in own] for name, own in pids.items() if all(own)}
-    stats, times = session.lateness(anew=anew), processes.reporter.times
-    assert stats is not None
-    return _Reading(
-        time.monotonic(),
-        stats,
-        {} if times is None else times.count_late_causes(),
-        {name: sum(p.cpu_times().user + p.cpu_times().system for p in own) for name, own in found.items()},
-        {name: sum(p.memory_info().rss for p in own) for name, own in found.items()},
-    )
+    found = {}
+    for name, own in pids.items():
+        if all(own):
+            times, memory = zip(*((p.cpu_times(), p.memory_info()) for p in map(psutil.Process, own)), strict=True)
+            found[name] = (sum(one.user + one.system for one in times), sum(one.rss for one in memory))
+    return session.lateness(anew=anew), found
 
 
-def _compute_usage(begin: _Reading, end: _Reading) -> Usage:
-    before, after = begin.stats, end.stats
+def _compute_usage(session: Session, begin: _Reading, end: _Reading, seconds: float) -> Usage:
+    before, after, times = begin[0], end[0], session.processes.reporter.times
+    assert before is not None
+    assert after is not None
     ticks, late = after.ticks - before.ticks, after.late - before.late
     stats = after._replace(
         ticks=ticks, finished=after.finished - before.finished, late=late, late_share=late / max(1, ticks)
     )
-    both = begin.cpu_s.keys() & end.cpu_s.keys()
-    shares = {name: (end.cpu_s[name] - begin.cpu_s[name]) / (end.at_s - begin.at_s) for name in both}
-    return Usage(stats, end.late_causes, shares, {name: (begin.rss[name], end.rss[name]) for name in both})
+    both = {name: (begin[1][name], end[1][name]) for name in begin[1].keys() & end[1].keys()}
+    return Usage(
+        stats,
+        {} if times is None else times.count_late_causes(),
+        {name: (last[0] - first[0]) / seconds for name, (first, last) in both.items()},
+        {name: (first[1], last[1]) for name, (first, last) in both.items()},
+    )
 
 
 class Measurement(NamedTuple):
@@ -451,12 +445,13 @@ def _run_session(
     _raise_if_stopped(session)
     if len(readings) < 2:
         raise BenchError("the session ended before the window was over")
+    usage = _compute_usage(session, readings[0], readings[1], seconds)
     _run_until_answered(session, workers, EXIT_S)
     return Measurement(
         seconds,
         begin,
         {name: log for worker in workers for name, log in worker.read_logs().items()},
-        _compute_usage(*readings),
+        usage,
         truth,
         received,
         stops,
