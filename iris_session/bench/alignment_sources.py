@@ -188,7 +188,6 @@ class HeadsetMotion:
             name: Name of the sheet, for what the source remembers of it.
             sheet: True `T_world_sheet`.
             start_s: Session time at which it begins.
-            seconds: Duration.
             head_hz: Rate of head poses.
             distance_m: Range of the distance of the head.
             azimuth: Direction of the head from the sheet [rad]; default: any.

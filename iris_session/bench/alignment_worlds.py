@@ -336,16 +336,9 @@ def select_worlds(text: str) -> tuple[str, ...]:
 
 
 def run_worlds(
-    names: Sequence[str], headsets: int, seed: int, progress: Callable[[str], None] = lambda _: None
+    names: Sequence[str], headsets: int, seed: int, progress: Callable[[str], None]
 ) -> dict[str, dict[str, float]]:
-    """Run worlds with rooms of two headsets each, on all processors.
-
-    Args:
-        names: Worlds.
-        headsets: Headsets per world; an odd one is left out.
-        seed: Random seed.
-        progress: Called with a short text before each world.
-    """
+    """Run worlds with rooms of two headsets each, on all processors. Of `headsets` per world an odd one is left out."""
     rooms = max(1, headsets // 2)
     workers = min(os.cpu_count() or 1, rooms)
     results = {}

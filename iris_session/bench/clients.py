@@ -44,12 +44,9 @@ class ClientJob(msgspec.Struct, frozen=True):
     """One client.
 
     Attributes:
-        name: Its name.
-        role: Its role.
         robot: Robot to drive with the right controller.
         samples: Send 3 devices x 72 Hz.
         profile: Profile of its impaired link; empty: none.
-        plugin: Its plug-in.
         alone: It has a process of its own.
         loads_s: Of a browser: times in the window at which it fetches assets [s].
     """
@@ -68,10 +65,8 @@ class Job(msgspec.Struct, frozen=True):
     """Job of one process.
 
     Attributes:
-        address: Address of the session.
         origin_ns: Session time zero on CLOCK_MONOTONIC.
         log: File to write.
-        clients: The clients.
         keep_poses: Log every decoded pose of every frame.
         stream: Media stream to subscribe to; empty: none.
         topology: File of the topology of a deformable stream, instead of the scene's asset.

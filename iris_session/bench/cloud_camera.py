@@ -117,8 +117,6 @@ class CloudCase(msgspec.Struct, frozen=True):
     """One case.
 
     Attributes:
-        name: Its name.
-        cameras: Number of cameras.
         pixels: Pixels of a cloud, shared by its cameras; 0 for the recorded frames.
         points: Budget of points.
         voxel_m: Least edge of the cells [m].

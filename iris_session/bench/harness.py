@@ -348,19 +348,14 @@ def measure(
     """Run a session with clients and measure `seconds` of it, warm-up excluded.
 
     Args:
-        model: Model of the session.
-        clients: Its clients.
-        seconds: Length of the measured window.
         seed: Random seed of the links.
         actions: Functions to call during the window, in order of their times.
         keep_poses: Keep the true poses of every published tick.
-        curve: Encrypt and authenticate.
         assets: Store of the scene's assets; False: clients get poses only.
         record: File of the recording; False: none.
         stream: Media stream that clients subscribe to.
         topology: File of its topology.
         on_tick: Called after every tick, warm-up included.
-        progress: Called with short texts.
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
