@@ -61,6 +61,11 @@ class ClientJob(msgspec.Struct, frozen=True):
     loads_s: tuple[float, ...] = ()
 
 
+def make_operators(robots: Sequence[str], profile: str = "") -> list[ClientJob]:
+    """Return one operator for each robot."""
+    return [ClientJob(f"operator{i}", "operator", robot, True, profile) for i, robot in enumerate(robots)]
+
+
 class Job(msgspec.Struct, frozen=True):
     """Job of one process.
 

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from iris_session.bench.clients import ClientJob
+from iris_session.bench.clients import ClientJob, make_operators
 from iris_session.bench.cloud_camera import CloudCase
 from iris_session.bench.cloud_stream import LEAD_S, WITH, plan_stream
 from iris_session.bench.harness import Action, BenchRun, measure
@@ -100,11 +100,9 @@ def _measure_beside(camera: PluginProcess, seconds: float, seed: int, progress: 
         if one.kind == WITH:
             actions.append((one.begin_s, lambda _: camera.send("run", ROOM, plan[0].length_s)))
         actions.append((one.end_s, read_ticks))
-    arms = arm_names(2)
-    people = [ClientJob(f"operator{i}", "operator", arm, samples=True) for i, arm in enumerate(arms)]
     got = measure(
         n_arms_scene(2).compile(),
-        [*people, ClientJob("observer", "observer")],
+        [*make_operators(arm_names(2)), ClientJob("observer", "observer")],
         plan[-1].end_s + 0.2,
         seed=seed,
         actions=actions,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from iris_session.bench.baseline import measure_baseline
-from iris_session.bench.clients import ClientJob
+from iris_session.bench.clients import ClientJob, make_operators
 from iris_session.bench.harness import Measurement, measure
 from iris_session.bench.report import BenchReport, make_bar, summarize_percentiles
 from iris_session.bench.state import SESSION_KEYS
@@ -32,8 +32,7 @@ def run_input(
     Reference: `measure_baseline`.
     """
     model = n_arms_scene(robots).compile()
-    arms = arm_names(robots)
-    specs = [ClientJob(f"operator{i}", "operator", arms[i], True, profile) for i in range(operators)]
+    specs = make_operators(arm_names(robots)[:operators], profile)
     specs += [ClientJob(f"observer{i}", "observer", profile=profile) for i in range(observers)]
     progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(operators + observers)

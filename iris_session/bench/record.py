@@ -30,7 +30,7 @@ import psutil
 import rerun as rr
 from numpy.typing import NDArray
 
-from iris_session.bench.clients import CLIENTS, ClientJob, Job
+from iris_session.bench.clients import CLIENTS, Job, make_operators
 from iris_session.bench.harness import make_session_config, measure
 from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
@@ -113,7 +113,7 @@ def run_record(
             progress(f"round {i + 1} of {2 * rounds}, {'with' if recorded else 'without'} recording")
             got = measure(
                 make_record_scene(seed).compile(),
-                _make_operators(),
+                make_operators(arm_names(OPERATORS)),
                 length_s,
                 record=path if recorded else False,
                 seed=seed,
@@ -139,10 +139,6 @@ def run_record(
     }
     params = {"operators": OPERATORS, "bodies": BODIES, "seconds": 2 * rounds * length_s, "rounds": rounds}
     return BenchReport(results, make_record_bars(results), params=params)
-
-
-def _make_operators() -> list[ClientJob]:
-    return [ClientJob(f"operator{i}", "operator", arm, samples=True) for i, arm in enumerate(arm_names(OPERATORS))]
 
 
 def _wait_for_index(path: Path) -> None:
@@ -430,7 +426,7 @@ class RecordedSession(Plugin):
         model = make_record_scene(seed).compile()
         self._session = Session(model, config=make_session_config(record=Path(path)))
         self._session.start()
-        job = Job(self._session.address, self._session.origin_ns, "", tuple(_make_operators()))
+        job = Job(self._session.address, self._session.origin_ns, "", tuple(make_operators(arm_names(OPERATORS))))
         self._operators = PluginProcess(CLIENTS, job)
         self._session.run(seconds=START_S, until=self._operators.has_answered)
         self._operators.read()
