@@ -9,11 +9,10 @@ from __future__ import annotations
 import gc
 import math
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
@@ -67,7 +66,6 @@ def run_join(
         if ready["built"]:
             raise BenchError(f"{ready['built']} assets were encoded again although the cache is warm")
         paths = [store.path(address) for address in ready["addresses"]]
-        port = stack.enter_context(_serve_in_bulk(paths))
         joiner = stack.enter_context(PluginProcess("iris_session.bench.join:Joiner", str(folder / "cache")))
         joiner.read()  # it is made
 
@@ -86,7 +84,7 @@ def run_join(
             progress=progress,
         )
         (first, begin_ns, _), (second, _, end_ns), copied = (joiner.read() for _ in range(3))
-        bare_s: float = joiner.ask("transfer_in_bulk", port)
+        bare_s = _transfer_in_bulk(joiner, paths)
     results = {
         "ready_s": round(ready["seconds"], 3),
         "server_rss_mib": round(ready["rss_mib"], 1),
@@ -132,26 +130,17 @@ def _compute_age_p99_ms(logs: dict[str, Log], begin_ns: int, end_ns: int) -> flo
     return p99_ms
 
 
-@contextmanager
-def _serve_in_bulk(paths: list[Path]) -> Iterator[int]:
-    """Serve all assets in one message, in a thread. Yield the port."""
-    with zmq.Context() as context:
-        socket = context.socket(zmq.REP)
-        port = socket.bind_to_random_port("tcp://127.0.0.1")
-
-        def serve() -> None:
-            with suppress(zmq.ZMQError):  # closed
-                socket.recv()
-                socket.send_multipart([path.read_bytes() for path in paths], copy=False)
-                socket.poll(60_000)  # until it is sent
-
-        thread = threading.Thread(target=serve, name="bench-bare", daemon=True)
-        thread.start()
-        try:
-            yield port
-        finally:
-            context.destroy(linger=0)
-            thread.join()
+def _transfer_in_bulk(joiner: PluginProcess, paths: list[Path]) -> float:
+    """Return the seconds for all assets in one message."""
+    with zmq.Context() as context, context.socket(zmq.REP) as socket:
+        socket.linger = 0
+        joiner.send("transfer_in_bulk", socket.bind_to_random_port("tcp://127.0.0.1"))
+        if not socket.poll(round(JOIN_S * 1e3)):
+            raise BenchError("the process that joins does not ask for the bulk transfer")
+        socket.recv()
+        socket.send_multipart([path.read_bytes() for path in paths], copy=False)
+        bare_s: float = joiner.read()
+        return bare_s
 
 
 # --- the process that joins -------------------------------------------------------------------------------------------
