@@ -294,37 +294,38 @@ def make_session_config(
 
 #: Seconds after the beginning of the window, and a function to call then; it must be fast.
 Action = tuple[float, Callable[[BenchRun], None]]
+#: A function that begins a stall (True) or ends it.
+Stall = Callable[[BenchRun, bool], None]
 
 
-def plan_stalls(
-    plan: Sequence[Interval], stalls: Mapping[str, Callable[[BenchRun, bool], None]], resumed: dict[Interval, int]
-) -> list[Action]:
+def plan_stalls(plan: Sequence[Interval], stalls: Mapping[str, Stall], resumed: dict[Interval, int]) -> list[Action]:
     """Return the actions that begin and end the stalls of a plan.
 
     Args:
         plan: Intervals of the window.
-        stalls: By kind of interval, a function that begins a stall (True) or ends it.
+        stalls: By kind of interval.
         resumed: Filled with the session time at which each stall ended [ns].
     """
 
-    def end(run: BenchRun, interval: Interval) -> None:
-        resumed[interval] = run.session.clock()
-        stalls[interval.kind](run, False)
+    def switch(run: BenchRun, interval: Interval, begins: bool) -> None:
+        if not begins:
+            resumed[interval] = run.session.clock()
+        stalls[interval.kind](run, begins)
 
-    actions: list[Action] = []
-    for one in plan:
-        if one.kind in stalls:
-            actions.append((one.stall_s, lambda run, begin=stalls[one.kind]: begin(run, True)))  # type: ignore[misc]
-            actions.append((one.resume_s, functools.partial(end, interval=one)))
-    return actions
+    return [
+        (at_s, functools.partial(switch, interval=one, begins=begins))
+        for one in plan
+        if one.kind in stalls
+        for at_s, begins in ((one.stall_s, True), (one.resume_s, False))
+    ]
 
 
-def stop_client(name: str) -> Callable[[BenchRun, bool], None]:
+def stop_client(name: str) -> Stall:
     """Return a stall of the process of a client, by SIGSTOP."""
     return lambda run, begins: run.by_client[name].send_signal(signal.SIGSTOP if begins else signal.SIGCONT)
 
 
-def stall_link(name: str) -> Callable[[BenchRun, bool], None]:
+def stall_link(name: str) -> Stall:
     """Return a stall of the link of a client, which passes nothing meanwhile."""
     return lambda run, begins: run.command_links(f"{'stall' if begins else 'resume'} @{run.links[name]}")
 

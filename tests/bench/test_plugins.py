@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+from iris_session.bench.clients import BROWSERS, ClientJob
+from iris_session.bench.harness import _group_clients
 from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError
 from iris_session.cli.main import main
@@ -42,6 +44,13 @@ def test_calls_are_answered_in_their_order_and_failures_are_named(monkeypatch: p
             worker.ask("end", timeout_s=30.0)
     with PluginProcess(ECHO, "") as worker, pytest.raises(BenchError, match=r"Echo.*3"):
         worker.read(30.0)
+
+
+def test_at_most_four_clients_of_one_plugin_share_a_process() -> None:
+    clients = [ClientJob(f"client{i}", "observer") for i in range(5)]
+    clients += [ClientJob(f"alone{i}", "observer", alone=True) for i in range(2)]
+    clients += [ClientJob(f"browser{i}", "observer", plugin=BROWSERS) for i in range(2)]
+    assert [len(group) for group in _group_clients(clients)] == [4, 1, 1, 1, 2]
 
 
 @pytest.mark.long
