@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -80,7 +80,10 @@ class ProbeResult(NamedTuple):
 
 @dataclass
 class Wearer:
-    """A wearer as the product sees it. `notices`: those that it has not acted on yet."""
+    """A wearer as the product sees it.
+
+    `notices`: those that it has not acted on yet; `sheets`: prints that lie elsewhere for it than for the room.
+    """
 
     room: Room
     number: int
@@ -101,10 +104,6 @@ class Wearer:
     def robot(self) -> str:
         return f"robot{self.number}"
 
-    def find_sheet(self, name: str) -> tuple[Array, Array]:
-        """Return the true pose of the sheet that this wearer looks at: there may be two prints."""
-        return self.sheets.get(name) or self.room.sheets[name]
-
     # --- what wearers do: generators of the time at which each goes on ---
 
     def look(self, name: str, seconds: float = 0.0, **how: Any) -> Iterator[int]:
@@ -113,7 +112,8 @@ class Wearer:
         seconds = seconds or max(2.0, 6.0 / source.hz)
         how.setdefault("print_scale", room.print_scale.get(name, 0.0))
         yield room.now_ns + TURN_NS
-        found = self.motion.look(name, self.find_sheet(name), room.now_s, seconds, head_hz=HEAD_HZ, **how)
+        sheet = self.sheets.get(name) or room.sheets[name]
+        found = self.motion.look(name, sheet, room.now_s, seconds, head_hz=HEAD_HZ, **how)
         self._last_sheet = name
         self.viewpoint += 1
         events = [(t, "", T) for t, T in zip(found.head_s, found.heads, strict=True)]
@@ -132,7 +132,7 @@ class Wearer:
                 yield from self.look(name, **how)
                 yield from self.pause(WALK_S)
 
-    def pause(self, seconds: float, *, heeds: bool = False, look_s: float = 0.0) -> Iterator[int]:
+    def pause(self, seconds: float, *, heeds: bool = False) -> Iterator[int]:
         """Walk about and look at no sheet; `heeds`: glance at one when a notice asks for it."""
         room = self.room
         end_s = room.now_s + seconds
@@ -146,7 +146,7 @@ class Wearer:
             if heeds and asked:
                 yield round((room.now_s + REACTION_S) * SECOND)
                 named = [name for name in room.anchors if any(f"'{name}'" in text for text in asked)]
-                yield from self.look((named or [self._last_sheet or next(iter(room.anchors))])[0], look_s)
+                yield from self.look((named or [self._last_sheet or next(iter(room.anchors))])[0])
                 self.notices.clear()
                 yield room.now_ns + TURN_NS
         yield round(max(end_s, room.now_s) * SECOND)
@@ -157,15 +157,14 @@ class Wearer:
         p = (1.5 * math.cos(self._walked), 1.5 * math.sin(self._walked), 1.6)
         return self.motion.place(self.room.now_s, (p, quat_from_yaw(self._walked + 0.5 * math.pi)))
 
-    def repeat_last(self, name: str, seconds: float, hz: float, heads: bool = True) -> Iterator[int]:
+    def repeat_last(self, name: str, seconds: float, hz: float) -> Iterator[int]:
         """Let the source repeat its last pose of a sheet while its wearer looks elsewhere."""
         room = self.room
         end_s = room.now_s + seconds
         yield room.now_ns + TURN_NS
         while room.now_s < end_s:
             yield round((room.now_s + 1.0 / hz) * SECOND)
-            if heads:
-                self.report_head(self.walk(1.0 / hz), to_authority=True)
+            self.report_head(self.walk(1.0 / hz), to_authority=True)
             self.report_sheet(name, self.motion.last[name])
 
     # --- messages ---
@@ -199,28 +198,18 @@ class Wearer:
 
 
 class Room:
-    """One session with its headsets. `sheets`: true poses; `anchors`: configured ones."""
+    """One session with two headsets. `sheets`: true poses; `anchors`: configured ones."""
 
     def __init__(
         self,
         rng: np.random.Generator,
         anchors: Mapping[str, PoseTuple],
         source: SheetSource,
-        headsets: int = 2,
         *,
-        drift_m_per_min: float | None = None,
-        marks: Mapping[str, Mapping[str, Vec3]] | None = None,
+        drift_m_per_min: float,
+        marks: Mapping[str, Mapping[str, Vec3]],
     ) -> None:
-        """Create a room with robots 1 m from the middle of the anchors.
-
-        Args:
-            rng: Everything random comes from it.
-            anchors: Configured `T_world_anchor`.
-            source: Of sheet poses, of every headset.
-            headsets: Number of headsets.
-            drift_m_per_min: Of every tracking frame; default: that of docs/anchors.md.
-            marks: Positions of marks by anchor and id of the mark.
-        """
+        """Create a room with robots 1 m from the middle of the anchors; everything random comes from `rng`."""
         self.rng = rng
         self.anchors = dict(anchors)
         self.sheets = {name: to_array_pose(T) for name, T in anchors.items()}
@@ -232,27 +221,25 @@ class Room:
         self.is_absolute = True  # the world is where the configured sheets are
         self.quiet_hours = 0.0  # headset hours without a cause for an alarm
         poses = {name: Pose(*T) for name, T in anchors.items()}
-        sizes = dict.fromkeys(anchors, SHEET_M)
         self.service = AlignmentService(
             self._offer,
             Drops(),
             anchors=poses,
-            anchor_sizes=sizes,
-            anchor_marks=marks or {},
+            anchor_sizes=dict.fromkeys(anchors, SHEET_M),
+            anchor_marks=marks,
             proposal_period_ns=PROPOSAL_NS,
         )
         centre = np.mean([p for p, _ in self.sheets.values()], axis=0)
         turn = rng.uniform(-math.pi, math.pi)
         way = np.array([math.cos(turn), math.sin(turn), 0.0])
         self.points = (self.sheets[next(iter(anchors))][0], centre + way, centre + 2.0 * way)
-        names = [f"robot{i + 1}" for i in range(headsets)]
+        names = ["robot1", "robot2"]
         tip = Pose(to_vec3(centre + way), IDENTITY_QUAT)
         self._view = FixedView(tips=dict.fromkeys(names, tip), q=dict.fromkeys(names, (0.0,)))
         robots = [RobotSpec(n, (f"{n}/j",), (f"{n}/j",), f"{n}/tcp", f"{n}/base") for n in names]
         self.authority = Authority(msgspec.structs.replace(CONFIG, anchors=poses), robots, ())
         self._stepped_ns = 0
-        drift = {} if drift_m_per_min is None else {"drift_m_per_min": drift_m_per_min}
-        self.people = [Wearer(self, i + 1, HeadsetMotion(rng, source, **drift)) for i in range(headsets)]
+        self.people = [Wearer(self, i + 1, HeadsetMotion(rng, source, drift_m_per_min)) for i in range(len(names))]
         for p in self.people:
             p.say(Join(f"key{p.number}", "operator", f"person{p.number}"))
         self.step()
@@ -334,34 +321,22 @@ class Room:
 
     def probe(self, label: str = "") -> None:
         """Record what each headset and each pair would do and see now."""
-        found = [self._probe_person(p) for p in self.people]
-        for one, finding in zip(self.people, found, strict=True):
-            if self.is_absolute:
-                self.findings.append((label, finding))
-            for other, theirs in zip(self.people, found, strict=True):
-                if other.number > one.number:
-                    self.findings.append((label, self._probe_pair((one, finding), (other, theirs))))
+        allowed = {p.number: self._try_clutch(p) for p in self.people}
+        groups = [[p] for p in self.people] if self.is_absolute else []
+        self.findings += [(label, self._probe(group, allowed)) for group in [*groups, self.people]]
 
-    def _probe_person(self, p: Wearer) -> ProbeResult:
-        is_allowed = self._try_clutch(p)
-        is_told = p.is_told or not is_allowed
-        if p.alignment is None:
-            return ProbeResult((p.number,), is_allowed, is_told)
-        errors, stated = [], []
-        for X in self.points:
-            errors.append(float(np.linalg.norm(self.compute_offset(p, X))))
-            stated.append(length_p95(self.state_covariance(p, X)))
-        return ProbeResult((p.number,), is_allowed, is_told, tuple(errors), tuple(stated))
-
-    def _probe_pair(self, a: tuple[Wearer, ProbeResult], b: tuple[Wearer, ProbeResult]) -> ProbeResult:
-        who = (a[0].number, b[0].number)
-        is_allowed, is_told = a[1].is_allowed and b[1].is_allowed, a[1].is_told or b[1].is_told
-        if a[0].alignment is None or b[0].alignment is None:
+    def _probe(self, group: Sequence[Wearer], allowed: Mapping[int, bool]) -> ProbeResult:
+        """Return how far from the truth one headset places the points, or from each other a pair does."""
+        who = tuple(p.number for p in group)
+        is_allowed = all(allowed[number] for number in who)
+        is_told = not is_allowed or any(p.is_told for p in group)
+        if any(p.alignment is None for p in group):
             return ProbeResult(who, is_allowed, is_told)
         errors, stated = [], []
         for X in self.points:
-            errors.append(float(np.linalg.norm(self.compute_offset(a[0], X) - self.compute_offset(b[0], X))))
-            stated.append(length_p95(self.state_covariance(a[0], X) + self.state_covariance(b[0], X)))
+            first, *others = (self.compute_offset(p, X) for p in group)
+            errors.append(float(np.linalg.norm(first - sum(others))))
+            stated.append(length_p95(sum((self.state_covariance(p, X) for p in group), np.zeros((3, 3)))))
         return ProbeResult(who, is_allowed, is_told, tuple(errors), tuple(stated))
 
     def compute_offset(self, p: Wearer, X: Array) -> Array:

@@ -74,9 +74,9 @@ class SheetSource:
     `hz`: rate of new poses, each reported `repeats` times at `hz * repeats`. `late_s`: by how much later than its
     picture an observation is stamped, uniform. `size_sigma`: of the source's own measure of the sheet, as share;
     `focal`: share by which its focal length is wrong. `corner_px`: constant error of each detected corner, per axis.
-    `weight`: of a new pose in a smoothing filter. `remembers`: the first second repeats a pose of an earlier session.
-    `viewpoints`: `head` (a new number at every place), `each` (a new one at every observation), `zero`.
-    `reported_as`: `ObservationSource`.
+    `shake_m`: of the head from frame to frame, per axis, which moves what it sees. `weight`: of a new pose in a
+    smoothing filter. `remembers`: the first second repeats a pose of an earlier session. `viewpoints`: `head` (a new
+    number at every place), `each` (a new one at every observation), `zero`. `reported_as`: `ObservationSource`.
     """
 
     hz: float = 10.0
@@ -85,6 +85,7 @@ class SheetSource:
     size_sigma: float = 0.0
     focal: float = 0.0
     corner_px: float = 0.0
+    shake_m: float = HEAD_SIGMA_M
     weight: float = 1.0
     remembers: bool = False
     viewpoints: str = "head"
@@ -140,11 +141,8 @@ class HeadsetMotion:
 
     def T_world_tracking(self, at_s: float) -> tuple[Array, Array]:
         """Return the true pose of the tracking frame at a time."""
-        p = self._p0 + at_s * self.velocity
-        if not self.yaw_rad_per_s:
-            return p, self._q0
-        dq = quat_exp(np.array([0.0, 0.0, self.yaw_rad_per_s * max(at_s - self._turned_from_s, 0.0)]))
-        return self._turned_about + quat_to_matrix(dq) @ (p - self._turned_about), quat_multiply(dq, self._q0)
+        p, q = self.compute_frames(np.array([at_s]))
+        return p[0], q[0]
 
     def shift_frame(self, by: Array) -> None:
         """Move the tracking frame at once, without a word."""
@@ -190,7 +188,6 @@ class HeadsetMotion:
             name: Name of the sheet, for what the source remembers of it.
             sheet: True `T_world_sheet`.
             start_s: Session time at which it begins.
-            seconds: Duration.
             head_hz: Rate of head poses.
             distance_m: Range of the distance of the head.
             azimuth: Direction of the head from the sheet [rad]; default: any.
@@ -204,7 +201,7 @@ class HeadsetMotion:
         p, q = path.place_sheet(stamped - self._late_s, sheet)
         p, q = self._detect(p, q, print_scale)
         head_p, head_q = path.compute(stamped)
-        head_p = head_p + rng.normal(0.0, HEAD_SIGMA_M, (n, 3))
+        head_p = head_p + rng.normal(0.0, s.shake_m, (n, 3))
         world_p = head_p + np.einsum("nij,nj->ni", quat_to_matrix(head_q), p)
         p, q = self.to_tracking(stamped, world_p, quat_multiply(head_q, q))
         p, q = self._filter(name, p, q)
@@ -213,8 +210,8 @@ class HeadsetMotion:
         head_s = start_s + np.arange(max(1, round(seconds * head_hz))) / head_hz
         at_p, at_q = path.compute(head_s)
         at_p = at_p + rng.normal(0.0, HEAD_SIGMA_M, at_p.shape)
-        heads = _to_poses(*self.to_tracking(head_s, at_p, at_q))
-        poses = _to_poses(p, q)
+        heads = to_poses(*self.to_tracking(head_s, at_p, at_q))
+        poses = to_poses(p, q)
         self.last[name] = poses[-1]
         return Glance(head_s.tolist(), heads, times.tolist(), poses)
 
@@ -322,13 +319,21 @@ def _solve_corner_errors(p: Array, q: Array, corners_px: Array) -> tuple[Array, 
     return step[:, :3], step[:, 3:]
 
 
-def _to_poses(p: Array, q: Array) -> list[PoseTuple]:
+def to_poses(p: Array, q: Array) -> list[PoseTuple]:
+    """Return poses (n, 3), (n, 4) as tuples."""
     return [(to_vec3(a), to_quat(b)) for a, b in zip(p, q, strict=True)]
 
 
 def to_array_pose(T: PoseTuple) -> tuple[Array, Array]:
     """Return a pose as arrays (3,) and (4,)."""
     return np.array(T[0]), np.array(T[1])
+
+
+def draw_held_poses(rng: np.random.Generator, held: tuple[Array, Array], n: int) -> tuple[Array, Array]:
+    """Return `n` observations, in the frame of `held`, of a controller in its holder: the noise of docs/anchors.md."""
+    noise = mix_viewpoint_noise(rng.normal(size=6), rng.normal(size=(n, 6)))
+    turns = quat_exp(HOLDER_SIGMA_RAD * noise[:, 3:])
+    return held[0] + TIP_SIGMA_M * noise[:, :3], quat_multiply(turns, np.broadcast_to(held[1], (n, 4)))
 
 
 def draw_level(rng: np.random.Generator, size: float) -> Array:

@@ -1,9 +1,9 @@
 """`bench alignment --worlds`: worlds in which an alignment can go wrong, one per row of the table in docs/anchors.md,
 and mixes of what real laboratories have.
 
-A world is a function of a `Room` (`alignment_room`): it says what the wearers do and what happens, and probes. A world
-with several variants gives each of its rooms one of them, in turn. Figures are over all probes, points (the sheet, 1 m
-and 2 m beside it) and headsets or pairs:
+A world is a list of what happens in a `Room` (`alignment_room`), and of probes. A world with several variants gives
+each of its rooms one of them, in turn. Figures are over all probes, points (the sheet, 1 m and 2 m beside it) and
+headsets or pairs:
 
 - `sheet_mm_p95`, `at_1m_mm_p95`, `at_2m_mm_p95`: distance between the places at which two headsets display a point.
 - `stated_..._mm_p50`: median of the p95 that is stated for such a pair.
@@ -34,110 +34,108 @@ from anchors.lie import quat_exp, quat_multiply, quat_to_matrix, to_quat, to_vec
 from anchors.pose import IDENTITY_POSE, PoseTuple
 from iris_session.bench.alignment_room import SECOND, ProbeResult, Room, Wearer
 from iris_session.bench.alignment_sources import (
-    HOLDER_SIGMA_RAD,
+    DRIFT_M_PER_MIN,
     MARKS,
     ONE,
     TIP_SIGMA_M,
     TRIANGLE,
     SheetSource,
+    draw_held_poses,
     draw_level,
     draw_vector,
+    to_poses,
 )
 from iris_session.bench.report import Bar, BenchError, make_bar
-from iris_session.emulator.sheet_noise import mix_viewpoint_noise
 from iris_session.protocol.names import AnchorKind, Device, ObservationSource
 
 TOUCH_COVARIANCE: Final = tuple(TIP_SIGMA_M**2 if i % 7 == 0 else 0.0 for i in range(36))
 
-PLAIN: Final = SheetSource()
-#: MRUK and spatial markers: about one pose a second.
-SLOW: Final = SheetSource(hz=1.0)
-QR_5HZ: Final = SheetSource(hz=5.0)
+
+# --- what happens -----------------------------------------------------------------------------------------------------
+
+#: Something that happens in a room, or that its wearers do beside each other.
+Step = Callable[[Room], None]
 
 
-def run_all(room: Room, what: Callable[[Wearer], Iterator[int]]) -> None:
-    """Let all wearers do the same, beside each other."""
-    room.run(what(p) for p in room.people)
+def everybody(act: Callable[[Wearer], Iterator[int]]) -> Step:
+    """Let all wearers do the same."""
+    return lambda room: room.run(act(p) for p in room.people)
 
 
-# --- worlds -----------------------------------------------------------------------------------------------------------
+def survey(viewpoints: int = 3, names: str = "a") -> Step:
+    return everybody(lambda p: p.survey(names, viewpoints))
 
 
-def look_at_moved_sheet(room: Room) -> None:
-    """W1: one of three sheets lies 50 mm elsewhere, and is looked at last."""
-    at, turn = room.sheets["c"]
-    room.sheets["c"] = (at + draw_level(room.rng, 0.05), turn)
-    _survey_three(room)
+def look(seconds: float = 0.0) -> Step:
+    return everybody(lambda p: p.look("a", seconds))
 
 
-def look_at_swapped_sheets(room: Room) -> None:
-    """W1: the last two of three sheets are swapped."""
+def pause(seconds: float, *, heeds: bool = False) -> Step:
+    return everybody(lambda p: p.pause(seconds, heeds=heeds))
+
+
+CAUSE: Final[Step] = Room.mark_cause
+PROBE: Final[Step] = Room.probe
+PROBE_AFTER: Final[Step] = lambda room: room.probe("after")  # noqa: E731
+#: Everybody looks at the sheet once more, and waits until what comes of it is in force.
+GLANCE: Final = (look(), pause(10.0, heeds=True), PROBE_AFTER)
+SURVEY_THREE: Final = (CAUSE, survey(2, "abc"), PROBE, pause(20.0, heeds=True), PROBE)
+
+
+def move_sheet(name: str) -> Step:
+    """Move a sheet by 50 mm."""
+
+    def move(room: Room) -> None:
+        at, turn = room.sheets[name]
+        room.sheets[name] = (at + draw_level(room.rng, 0.05), turn)
+
+    return move
+
+
+def swap_sheets(room: Room) -> None:
     room.sheets["b"], room.sheets["c"] = room.sheets["c"], room.sheets["b"]
-    _survey_three(room)
 
 
-def _survey_three(room: Room) -> None:
-    room.mark_cause()
-    run_all(room, lambda p: p.survey("abc", 2))
-    room.probe()
-    run_all(room, lambda p: p.pause(20.0, heeds=True))
-    room.probe()
-
-
-def pause_half_hour(room: Room) -> None:
-    """W2: no sheet is looked at for half an hour, while the tracking frame drifts."""
-    run_all(room, lambda p: p.survey("a"))
-    room.mark_cause()
-    for minutes in (5.0, 25.0):
-        run_all(room, lambda p, s=60.0 * minutes: p.pause(s))  # type: ignore[misc]
-        room.probe()
-    _glance(room)
-
-
-def drift_fast(room: Room) -> None:
-    """W2: a tracking frame that drifts by 20 mm a minute, for 110 s."""
-    run_all(room, lambda p: p.survey("a"))
-    room.mark_cause()
-    run_all(room, lambda p: p.pause(110.0))
-    room.probe()
-    _glance(room)
-
-
-def _glance(room: Room, seconds: float = 0.0) -> None:
-    """Let everybody look at the sheet once more, and wait until what comes of it is in force."""
-    run_all(room, lambda p: p.look("a", seconds))
-    run_all(room, lambda p: p.pause(10.0, heeds=True))
-    room.probe("after")
-
-
-def jump_silently(room: Room) -> None:
-    """W3: the tracking frame jumps by 50 mm without a word; the source is slow."""
-    run_all(room, lambda p: p.survey("a"))
-    room.mark_cause()
+def jump(room: Room) -> None:
+    """Move tracking frames by 50 mm without a word."""
     for p in room.people:
         p.motion.shift_frame(draw_level(room.rng, 0.05))
-    hz = room.people[0].motion.source.hz
-    run_all(room, lambda p: p.look("a", 12.0 / hz))
-    run_all(room, lambda p: p.pause(3.0))
-    room.probe()
-    run_all(room, lambda p: p.pause(15.0, heeds=True))
-    room.probe("after")
+
+
+def drift(m_per_min: float) -> Step:
+    """Let tracking frames drift so fast from now on, each in its direction."""
+
+    def change(room: Room) -> None:
+        for p in room.people:
+            p.motion.velocity *= m_per_min / 60.0 / np.linalg.norm(p.motion.velocity)
+
+    return change
+
+
+def turn_frames(room: Room) -> None:
+    """Let tracking frames turn by 0.5 degrees a minute."""
+    for p in room.people:
+        rate = math.radians(0.5) / 60.0 * room.rng.choice([-1.0, 1.0])
+        p.motion.turn_frame(rate, room.now_s, room.sheets["a"][0])
+
+
+def enlarge_print(room: Room) -> None:
+    """Print the sheet 2 % too large; the source reports the nominal size."""
+    room.print_scale["a"] = 0.02
 
 
 def bump_between(room: Room) -> None:
-    """W4: the only sheet is bumped by 50 mm after one person's alignment and before the next one's."""
+    """Bump the only sheet by 50 mm after one person's alignment and before the next one's."""
     room.is_absolute = False
     first, *others = room.people
     room.run([first.survey("a")])
-    at, turn = room.sheets["a"]
-    room.sheets["a"] = (at + draw_level(room.rng, 0.05), turn)
+    move_sheet("a")(room)
     room.mark_cause()
     room.run([first.pause(60.0, heeds=True), *(p.survey("a") for p in others)])
-    room.probe()
 
 
 def look_at_two_prints(room: Room) -> None:
-    """W4: two prints of one id lie 0.3 to 2 m apart, and everybody looks at the nearest."""
+    """Let everybody look at the nearest of two prints of one id, 0.3 to 2 m apart."""
     room.is_absolute = False
     first, *others = room.people
     at, turn = room.sheets["a"]
@@ -146,107 +144,28 @@ def look_at_two_prints(room: Room) -> None:
     room.run([first.survey("a")])
     room.mark_cause()
     room.run([first.pause(60.0, heeds=True), *(p.survey("a") for p in others)])
-    room.probe()
 
 
-def smooth_poses(room: Room) -> None:
-    """W5: a source smooths its poses and repeats each of them."""
-    run_all(room, lambda p: p.survey("a"))
-    run_all(room, lambda p: p.pause(5.0))
-    room.probe()
+def walk_round_sheet(p: Wearer) -> Iterator[int]:
+    return p.look("a", 6.0, walk_m_per_s=p.room.rng.uniform(0.3, 0.8))
 
 
-def freeze_poses(room: Room) -> None:
-    """W5: the last pose is repeated at 5 Hz for a minute, in which the tracking frame drifts by 20 mm."""
-    run_all(room, lambda p: p.survey("a"))
-    room.mark_cause()
-    for p in room.people:
-        p.motion.velocity *= 0.02 / 60.0 / np.linalg.norm(p.motion.velocity)
-    run_all(room, lambda p: p.repeat_last("a", 60.0, 5.0))
-    room.probe()
-    for p in room.people:
-        p.motion.velocity *= 0.003 / 0.02
-    run_all(room, lambda p: p.look("a", 1.2))
-    _glance(room)
-
-
-def number_badly(room: Room) -> None:
-    """W6: every look has a viewpoint of its own, or all have number 0."""
-    run_all(room, lambda p: p.survey("a"))
-    room.probe()
-    run_all(room, lambda p: p.survey("a", 2))
-    room.probe()
-
-
-def look_walking(room: Room) -> None:
-    """W7: wearers look while they walk round the sheet, with pictures 0 to 60 ms late."""
-    room.mark_cause()
-    run_all(room, lambda p: p.look("a", 6.0, walk_m_per_s=room.rng.uniform(0.3, 0.8)))
-    run_all(room, lambda p: p.pause(3.0))
-    room.probe()
-    _glance(room)
-
-
-def drift_yaw(room: Room, *, glances: bool) -> None:
-    """W8: the tracking frame turns by 0.5 degrees a minute, for nine minutes."""
-    run_all(room, lambda p: p.survey("a"))
-    room.mark_cause()
-    for p in room.people:
-        rate = math.radians(0.5) / 60.0 * room.rng.choice([-1.0, 1.0])
-        p.motion.turn_frame(rate, room.now_s, room.sheets["a"][0])
-    for _ in range(9):
-        run_all(room, lambda p: p.pause(58.0))
-        if glances:
-            run_all(room, lambda p: p.look("a", 2.0))
-    run_all(room, lambda p: p.pause(5.0))
-    room.probe()
-    _glance(room)
-
-
-def print_too_large(room: Room) -> None:
-    """W9: the print is 2 % too large, and the source reports the nominal size."""
-    room.print_scale["a"] = 0.02
-    room.mark_cause()
-    run_all(room, lambda p: p.survey("a", 1))
-    room.probe()
-    run_all(room, lambda p: p.survey("a", 2))
-    run_all(room, lambda p: p.pause(5.0))
-    room.probe()
-
-
-def mix_makers(room: Room) -> None:
-    """W10: controllers in holders whose pose their makers define otherwise, by 3 mm and 1 degree."""
-    room.mark_cause()
-    run_all(room, _report_holder)
-    run_all(room, lambda p: p.pause(3.0))
-    room.probe()
-
-
-def _report_holder(p: Wearer) -> Iterator[int]:
+def report_holder(p: Wearer) -> Iterator[int]:
+    """Report a controller in a holder whose pose its maker defines otherwise, by 3 mm and 1 degree."""
     rng, room = p.motion.rng, p.room
     off_p, off_q = np.array(draw_vector(rng, 0.003)), quat_exp(np.array(draw_vector(rng, math.radians(1.0))))
     at, turn = room.sheets["a"]
     for _ in range(3):
         p.viewpoint += 1
-        common = rng.normal(size=6)
-        for _ in range(20):
+        for pose in to_poses(*draw_held_poses(rng, (at + off_p, quat_multiply(turn, off_q)), 20)):
             yield room.now_ns + SECOND // 10
-            noise = mix_viewpoint_noise(common, rng.normal(size=6))  # docs/anchors.md: controller in its holder
-            q = quat_multiply(quat_exp(HOLDER_SIGMA_RAD * noise[3:]), quat_multiply(turn, off_q))
-            T = p.motion.place(room.now_s, (to_vec3(at + off_p + TIP_SIGMA_M * noise[:3]), to_quat(q)))
+            T = p.motion.place(room.now_s, pose)
             p.report_sheet("a", T, AnchorKind.CONTROLLER, device=Device.CONTROLLER_RIGHT)
         yield from p.pause(3.0)
 
 
-def touch_with_rough_tip(room: Room) -> None:
-    """W10: four marks are touched once each with a tip that is known to 3 mm."""
-    room.mark_cause()
-    run_all(room, _touch_marks)
-    run_all(room, lambda p: p.pause(3.0))
-    room.probe()
-
-
-def _touch_marks(p: Wearer) -> Iterator[int]:
+def touch_marks(p: Wearer) -> Iterator[int]:
+    """Touch four marks once each with a tip that is known to 3 mm."""
     rng, room = p.motion.rng, p.room
     off = rng.normal(0.0, 0.003 / math.sqrt(3.0), 3)
     heading = rng.uniform(-math.pi, math.pi)
@@ -259,58 +178,47 @@ def _touch_marks(p: Wearer) -> Iterator[int]:
         p.report_sheet("a", T, AnchorKind.TOUCH, mark=mark, device=Device.CONTROLLER_RIGHT, covariance=TOUCH_COVARIANCE)
 
 
-def report_zero_poses(room: Room) -> None:
-    """W11: twelve identical observations of the sheet at the origin, before the runtime has a pose. The origin is near
-    the head: where it was when the app began."""
-    room.mark_cause()
-
-    def report(p: Wearer) -> Iterator[int]:
-        p.motion.begin_at(np.append(room.rng.uniform(-1.5, 1.5, 2), 1.6), room.now_s)
-        away = draw_vector(room.rng, room.rng.uniform(0.3, 0.5))
-        for _ in range(12):
-            yield room.now_ns + SECOND // 10
-            p.report_head((away, IDENTITY_POSE[1]), to_authority=True)
-            p.report_sheet("a", IDENTITY_POSE)
-
-    run_all(room, report)
-    run_all(room, lambda p: p.pause(2.0))
-    room.probe()
-    run_all(room, lambda p: p.survey("a"))
-    room.probe("after")
+def report_zero_poses(p: Wearer) -> Iterator[int]:
+    """Report twelve identical observations of the sheet at the origin, before the runtime has a pose. The origin is
+    near the head: where it was when the app began."""
+    room = p.room
+    p.motion.begin_at(np.append(room.rng.uniform(-1.5, 1.5, 2), 1.6), room.now_s)
+    away = draw_vector(room.rng, room.rng.uniform(0.3, 0.5))
+    for _ in range(12):
+        yield room.now_ns + SECOND // 10
+        p.report_head((away, IDENTITY_POSE[1]), to_authority=True)
+        p.report_sheet("a", IDENTITY_POSE)
 
 
-def look_with_wrong_focal(room: Room) -> None:
-    """W12: the focal length is 5 % wrong; the first looks are from near by, the later ones from elsewhere."""
-    room.mark_cause()
+def look_from_near_by(room: Room) -> None:
+    """Look from near by, then from elsewhere."""
     way = room.rng.uniform(-math.pi, math.pi)
-    run_all(room, lambda p: p.survey("a", 2, distance_m=(0.4, 0.6), azimuth=way))
+    everybody(lambda p: p.survey("a", 2, distance_m=(0.4, 0.6), azimuth=way))(room)
     room.probe()
-    run_all(room, lambda p: p.look("a", distance_m=(0.9, 1.2), azimuth=way + math.pi))
-    run_all(room, lambda p: p.look("a", distance_m=(0.9, 1.2), azimuth=way + 0.5 * math.pi))
-    run_all(room, lambda p: p.pause(20.0, heeds=True))
-    room.probe()
+    for turn in (math.pi, 0.5 * math.pi):
+        everybody(lambda p, turn=turn: p.look("a", distance_m=(0.9, 1.2), azimuth=way + turn))(room)  # type: ignore[misc]
 
 
-def work_in_laboratory(room: Room) -> None:
-    """A mix: an ordinary two minutes, with a glance every half minute. Nothing happens."""
-    run_all(room, lambda p: p.survey(room.anchors, 3 if len(room.anchors) == 1 else 1))
-    room.probe()
-    for _ in range(4):
-        run_all(room, lambda p: p.pause(25.0, heeds=True))
-        run_all(room, lambda p: p.look(next(iter(room.anchors)), max(3.0, 3.0 / p.motion.source.hz)))
-    run_all(room, lambda p: p.pause(5.0, heeds=True))
-    room.probe()
+def survey_anchors(p: Wearer) -> Iterator[int]:
+    return p.survey(p.room.anchors, 3 if len(p.room.anchors) == 1 else 1)
+
+
+def glance_at_first(p: Wearer) -> Iterator[int]:
+    return p.look(next(iter(p.room.anchors)), max(3.0, 3.0 / p.motion.source.hz))
+
+
+# --- worlds -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One variant of a world: what happens, the sheets, and the source. `print_sigma`: of the size of each print."""
+    """One variant of a world: what happens, the sheets, and the source. `print_max`: of the size of each print."""
 
     name: str
-    happen: Callable[[Room], None]
-    source: SheetSource = PLAIN
+    steps: Sequence[Step]
+    source: SheetSource = field(default_factory=SheetSource)
     anchors: dict[str, PoseTuple] = field(default_factory=lambda: ONE)
-    drift_m_per_min: float | None = None
+    drift_m_per_min: float = DRIFT_M_PER_MIN
     print_max: float = 0.0
     survey_sigma_m: float = 0.0
     has_marks: bool = False
@@ -324,56 +232,78 @@ class Variant:
             if name != next(iter(room.sheets)):  # the first one is the world
                 off = rng.normal(0.0, self.survey_sigma_m, 3)
                 room.sheets[name] = (at + off, turn)
-        self.happen(room)
+        for step in self.steps:
+            step(room)
         return room
 
 
+#: An ordinary two minutes, with a glance every half minute. Nothing happens.
+WORK: Final = (
+    *(everybody(survey_anchors), PROBE),
+    *(pause(25.0, heeds=True), everybody(glance_at_first)) * 4,
+    *(pause(5.0, heeds=True), PROBE),
+)
+_OWN: Final = SheetSource(late_s=(0.05, 0.05), corner_px=0.35)
 _QR_SYSTEM: Final = ObservationSource.QR_SYSTEM
+#: "Smoothed 20 %": a new pose counts for a fifth. The largest errors are taken as two sigma.
 _MRUK: Final = SheetSource(hz=1.0, weight=0.2, size_sigma=0.0035, reported_as=_QR_SYSTEM)
 _HOLOLENS: Final = SheetSource(hz=3.0, weight=0.2, size_sigma=0.005, remembers=True, reported_as=_QR_SYSTEM)
-#: "Smoothed 20 %": a new pose counts for a fifth. The largest errors are taken as two sigma.
 MIXES: Final[dict[str, tuple[Variant, ...]]] = {
-    "lab_own_detector": (
-        Variant("", work_in_laboratory, SheetSource(late_s=(0.05, 0.05), corner_px=0.35), print_max=0.005),
+    "lab_own_detector": (Variant("", WORK, _OWN, print_max=0.005),),
+    "lab_system_qr": (Variant("", WORK, _MRUK),),
+    "lab_hololens": (Variant("", WORK, _HOLOLENS),),
+    # Surveyed with a tape measure that is read with care: 1 mm per axis, assumed.
+    "lab_three_sheets": (Variant("", WORK, _OWN, TRIANGLE, print_max=0.005, survey_sigma_m=0.001),),
+}
+
+
+def _jump_at(hz: float) -> Variant:
+    """The tracking frame jumps; the source is slow: 1 Hz are MRUK and spatial markers."""
+    steps = (survey(), CAUSE, jump, look(12.0 / hz), pause(3.0), PROBE, pause(15.0, heeds=True), PROBE_AFTER)
+    return Variant(f"{hz:g}hz", steps, SheetSource(hz=hz))
+
+
+def _turn(name: str, minute: Sequence[Step]) -> Variant:
+    """The tracking frame turns for nine minutes."""
+    return Variant(name, (survey(), CAUSE, turn_frames, *[*minute] * 9, pause(5.0), PROBE, *GLANCE))
+
+
+ROWS: Final[dict[str, tuple[Variant, ...]]] = {
+    "W1": (  # one of three sheets is moved and looked at last; the last two are swapped
+        Variant("moved", (move_sheet("c"), *SURVEY_THREE), anchors=TRIANGLE),
+        Variant("swapped", (swap_sheets, *SURVEY_THREE), anchors=TRIANGLE),
     ),
-    "lab_system_qr": (Variant("", work_in_laboratory, _MRUK),),
-    "lab_hololens": (Variant("", work_in_laboratory, _HOLOLENS),),
-    "lab_three_sheets": (
+    "W2": (  # no look for half an hour, while the tracking frame drifts; it drifts fast
+        Variant("pause", (survey(), CAUSE, pause(300.0), PROBE, pause(1500.0), PROBE, *GLANCE)),
+        Variant("fast", (survey(), CAUSE, pause(110.0), PROBE, *GLANCE), drift_m_per_min=0.02),
+    ),
+    "W3": (_jump_at(5.0), _jump_at(1.0)),
+    "W4": (Variant("bumped", (bump_between, PROBE)), Variant("prints", (look_at_two_prints, PROBE))),
+    "W5": (  # a source smooths its poses and repeats each; one repeats its last pose, while the frame drifts by 20 mm
+        Variant("smoothed", (survey(), pause(5.0), PROBE), SheetSource(hz=1.0, repeats=5, weight=0.2)),
         Variant(
-            "",
-            work_in_laboratory,
-            SheetSource(late_s=(0.05, 0.05), corner_px=0.35),
-            TRIANGLE,
-            print_max=0.005,
-            survey_sigma_m=0.001,  # of a tape measure that is read with care, per axis; assumed
+            "frozen",
+            (
+                *(survey(), CAUSE, drift(0.02), everybody(lambda p: p.repeat_last("a", 60.0, 5.0)), PROBE),
+                *(drift(DRIFT_M_PER_MIN), look(1.2), *GLANCE),
+            ),
+            SheetSource(hz=5.0),
         ),
     ),
-}
-ROWS: Final[dict[str, tuple[Variant, ...]]] = {
-    "W1": (
-        Variant("moved", look_at_moved_sheet, anchors=TRIANGLE),
-        Variant("swapped", look_at_swapped_sheets, anchors=TRIANGLE),
+    "W6": tuple(  # every look has a viewpoint of its own, or all have number 0
+        Variant(name, (survey(), PROBE, survey(2), PROBE), SheetSource(viewpoints=name)) for name in ("each", "zero")
     ),
-    "W2": (Variant("pause", pause_half_hour), Variant("fast", drift_fast, drift_m_per_min=0.02)),
-    "W3": (Variant("5hz", jump_silently, QR_5HZ), Variant("1hz", jump_silently, SLOW)),
-    "W4": (Variant("bumped", bump_between), Variant("prints", look_at_two_prints)),
-    "W5": (
-        Variant("smoothed", smooth_poses, SheetSource(hz=1.0, repeats=5, weight=0.2)),
-        Variant("frozen", freeze_poses, QR_5HZ),
+    "W7": (
+        Variant("", (CAUSE, everybody(walk_round_sheet), pause(3.0), PROBE, *GLANCE), SheetSource(late_s=(0.0, 0.06))),
     ),
-    "W6": (
-        Variant("each", number_badly, SheetSource(viewpoints="each")),
-        Variant("zero", number_badly, SheetSource(viewpoints="zero")),
+    "W8": (_turn("unseen", [pause(58.0)]), _turn("seen", [pause(58.0), look(2.0)])),
+    "W9": (Variant("", (enlarge_print, CAUSE, survey(1), PROBE, survey(2), pause(5.0), PROBE)),),
+    "W10": (
+        Variant("holder", (CAUSE, everybody(report_holder), pause(3.0), PROBE)),
+        Variant("touch", (CAUSE, everybody(touch_marks), pause(3.0), PROBE), has_marks=True),
     ),
-    "W7": (Variant("", look_walking, SheetSource(late_s=(0.0, 0.06))),),
-    "W8": (
-        Variant("unseen", lambda room: drift_yaw(room, glances=False)),
-        Variant("seen", lambda room: drift_yaw(room, glances=True)),
-    ),
-    "W9": (Variant("", print_too_large),),
-    "W10": (Variant("holder", mix_makers), Variant("touch", touch_with_rough_tip, has_marks=True)),
-    "W11": (Variant("", report_zero_poses),),
-    "W12": (Variant("", look_with_wrong_focal, SheetSource(focal=0.05)),),
+    "W11": (Variant("", (CAUSE, everybody(report_zero_poses), pause(2.0), PROBE, survey(), PROBE_AFTER)),),
+    "W12": (Variant("", (CAUSE, look_from_near_by, pause(20.0, heeds=True), PROBE), SheetSource(focal=0.05)),),
 }
 WORLDS: Final = ROWS | MIXES
 
@@ -406,16 +336,9 @@ def select_worlds(text: str) -> tuple[str, ...]:
 
 
 def run_worlds(
-    names: Sequence[str], headsets: int, seed: int, progress: Callable[[str], None] = lambda _: None
+    names: Sequence[str], headsets: int, seed: int, progress: Callable[[str], None]
 ) -> dict[str, dict[str, float]]:
-    """Run worlds with rooms of two headsets each, on all processors.
-
-    Args:
-        names: Worlds.
-        headsets: Headsets per world; an odd one is left out.
-        seed: Random seed.
-        progress: Called with a short text before each world.
-    """
+    """Run worlds with rooms of two headsets each, on all processors. Of `headsets` per world an odd one is left out."""
     rooms = max(1, headsets // 2)
     workers = min(os.cpu_count() or 1, rooms)
     results = {}

@@ -11,18 +11,16 @@ import contextlib
 import time
 from typing import Final
 
-import msgspec
 import numpy as np
 import zmq
 
 from iris_session.bench.plugins import Plugin, PluginProcess
-from iris_session.bench.report import BenchError, compute_percentile
+from iris_session.bench.report import BenchError, compute_percentile, summarize_percentiles
 from iris_session.system.priority import freeze_garbage_collector, tick_priority
 
 PERIOD_NS: Final = 2_000_000
 FRAME_NS: Final = round(1e9 / 60.0)
 FRAME_BYTES: Final = 3_700  # 300 moving bodies
-SECONDS: Final = 5.0
 WARM_UP_NS: Final = 1_000_000_000
 PER_PROCESS: Final = 4
 _END: Final = -1
@@ -30,12 +28,8 @@ RECEIVERS: Final = "iris_session.bench.baseline:Receivers"
 _JOIN_S: Final = 30.0
 
 
-def measure_baseline(receivers: int, seconds: float = SECONDS) -> dict[str, float]:
-    """Measure the baseline.
-
-    Args:
-        receivers: Number of receiving sockets.
-        seconds: Length of the measured part.
+def measure_baseline(receivers: int) -> dict[str, float]:
+    """Measure the baseline with a number of receiving sockets.
 
     Returns:
         `bare_age_ms_*`: from sending to the receiving program; `bare_late_tick_share`, `bare_lateness_ms_p99`: of a
@@ -49,20 +43,19 @@ def measure_baseline(receivers: int, seconds: float = SECONDS) -> dict[str, floa
         port = socket.bind_to_random_port("tcp://127.0.0.1")
         shares = [min(PER_PROCESS, receivers - i) for i in range(0, receivers, PER_PROCESS)]
         address = f"tcp://127.0.0.1:{port}"
-        workers = [stack.enter_context(PluginProcess(RECEIVERS, ReceiverJob(address, n))) for n in shares]
+        workers = [stack.enter_context(PluginProcess(RECEIVERS, address, n)) for n in shares]
         for worker in workers:
             worker.send("receive")
         for _ in range(receivers):
             if not socket.poll(round(_JOIN_S * 1e3)):
                 raise BenchError(f"the receivers of the reference did not join within {_JOIN_S:g} s")
             socket.recv()
-        lateness = _run_loop(socket, seconds)
+        lateness = _run_loop(socket, 5.0)
         socket.send(_encode_frame(_END))
         ages = np.array([age_ns for worker in workers for age_ns in _read_ages(worker)]) * 1e-6
     late = np.array(lateness) * 1e-6
     return {
-        "bare_age_ms_p50": compute_percentile(ages, 50),
-        "bare_age_ms_p99": compute_percentile(ages, 99),
+        **summarize_percentiles("bare_age_ms", ages),
         "bare_late_tick_share": round(float((late > PERIOD_NS * 1e-6).mean()), 6),
         "bare_lateness_ms_p99": compute_percentile(late, 99),
     }
@@ -97,28 +90,18 @@ def _encode_frame(sent_ns: int) -> bytes:
     return sent_ns.to_bytes(8, "little", signed=True) + bytes(FRAME_BYTES - 8)
 
 
-class ReceiverJob(msgspec.Struct, frozen=True):
-    """Job of one process of receivers: address, and number of sockets."""
-
-    address: str
-    sockets: int
-
-
 class Receivers(Plugin):
     """Sockets that receive frames."""
 
-    job_type = ReceiverJob
-
-    def __init__(self, job: ReceiverJob) -> None:
-        super().__init__(job)
+    def __init__(self, address: str, sockets: int) -> None:
         self._context = zmq.Context()
         self._poller = zmq.Poller()
-        for _ in range(job.sockets):
+        for _ in range(sockets):
             socket = self._context.socket(zmq.SUB)
             socket.setsockopt(zmq.RCVHWM, 2)
             socket.setsockopt(zmq.LINGER, 0)
             socket.setsockopt(zmq.SUBSCRIBE, b"")
-            socket.connect(job.address)
+            socket.connect(address)
             self._poller.register(socket, zmq.POLLIN)
 
     def receive(self) -> list[int]:

@@ -12,6 +12,7 @@ import hashlib
 import math
 import time
 import zlib
+from collections.abc import Sequence
 from typing import Any, ClassVar, Final
 
 import msgspec
@@ -32,17 +33,21 @@ MAX_FRAMES: Final = 8192
 #: State comes at 60 Hz; twice as many frames are room enough.
 MAX_HZ: Final = 120.0
 JOIN_S: Final = 30.0
+#: Plug-ins of clients. `BROWSERS` are at the session's page without a picture, `TABS` in a real Chromium.
+CLIENTS: Final = "iris_session.bench.clients:StateClients"
+MEDIA_CLIENTS: Final = "iris_session.bench.media_clients:MediaClients"
+BROWSERS: Final = "iris_session.bench.web_clients:Browsers"
+TABS: Final = "iris_session.bench.web_tab:Tab"
 
 
 class ClientJob(msgspec.Struct, frozen=True):
     """One client.
 
     Attributes:
-        name: Its name.
-        role: Its role.
         robot: Robot to drive with the right controller.
         samples: Send 3 devices x 72 Hz.
-        link: Address of its impaired link; empty: none.
+        profile: Profile of its impaired link; empty: none.
+        alone: It has a process of its own.
         loads_s: Of a browser: times in the window at which it fetches assets [s].
     """
 
@@ -50,23 +55,29 @@ class ClientJob(msgspec.Struct, frozen=True):
     role: str
     robot: str = ""
     samples: bool = False
-    link: str = ""
+    profile: str = ""
+    plugin: str = CLIENTS
+    alone: bool = False
     loads_s: tuple[float, ...] = ()
+
+
+def make_operators(robots: Sequence[str], profile: str = "") -> list[ClientJob]:
+    """Return one operator for each robot."""
+    return [ClientJob(f"operator{i}", "operator", robot, True, profile) for i, robot in enumerate(robots)]
 
 
 class Job(msgspec.Struct, frozen=True):
     """Job of one process.
 
     Attributes:
-        address: Address of the session.
         origin_ns: Session time zero on CLOCK_MONOTONIC.
         log: File to write.
-        clients: The clients.
         keep_poses: Log every decoded pose of every frame.
         stream: Media stream to subscribe to; empty: none.
         topology: File of the topology of a deformable stream, instead of the scene's asset.
-        server_public, public, secret: CURVE keys, Z85 text; empty: plain.
+        keys: CURVE keys of `CurveKeys`, Z85 text; empty: plain.
         page: Address of the session's page, for browsers.
+        links: Addresses of impaired links by client.
     """
 
     address: str
@@ -76,17 +87,9 @@ class Job(msgspec.Struct, frozen=True):
     keep_poses: bool = False
     stream: str = ""
     topology: str = ""
-    server_public: str = ""
-    public: str = ""
-    secret: str = ""
+    keys: tuple[str, ...] = ()
     page: str = ""
-
-    @property
-    def curve(self) -> CurveKeys | None:
-        """Keys of a client, `None` for a plain session."""
-        if not self.server_public:
-            return None
-        return CurveKeys(self.server_public.encode(), self.public.encode(), self.secret.encode())
+    links: dict[str, str] = {}
 
     def session_time_ns(self) -> int:
         """Return the present session time [ns]."""
@@ -98,9 +101,14 @@ class Job(msgspec.Struct, frozen=True):
         np.savez(self.log, allow_pickle=False, **flat)
 
 
-def make_web_secret(secret: str, name: str) -> bytes:
-    """Return the secret of a browser at an encrypted session, made from the secret of its job."""
-    return hashlib.sha256(f"{secret} {name}".encode()).digest()
+def make_curve_keys(keys: Sequence[str]) -> CurveKeys | None:
+    """Return the keys of a client, `None` for a plain session."""
+    return CurveKeys(*(key.encode() for key in keys)) if keys else None
+
+
+def make_web_secret(keys: Sequence[str], name: str) -> bytes:
+    """Return the secret of a browser at an encrypted session, made from the keys of its job."""
+    return hashlib.sha256(f"{keys[-1]} {name}".encode()).digest()
 
 
 class StateLog:
@@ -144,14 +152,14 @@ class BenchClient:
     def __init__(self, job: Job, spec: ClientJob) -> None:
         self.spec = spec
         self._job = job
-        devices = DEVICES if spec.samples else ()
+        link = job.links.get(spec.name)
         self.client = Client(
-            f"{spec.link}:{job.address.rpartition(':')[2]}" if spec.link else job.address,
+            f"{link}:{job.address.rpartition(':')[2]}" if link else job.address,
             role=spec.role,
             name=spec.name,
-            devices=devices,
+            devices=DEVICES if spec.samples else (),
             alignment="not_needed",
-            curve=job.curve,
+            curve=make_curve_keys(job.keys),
             on_state=self._on_state,
         )
         self.recording = False
@@ -219,11 +227,10 @@ class BenchClient:
 class StateClients(Plugin):
     """Clients of one process."""
 
-    job_type = Job
     client_type: ClassVar[type[BenchClient]] = BenchClient
 
     def __init__(self, job: Job) -> None:
-        super().__init__(job)
+        self._job = job
         self._clients = [self.client_type(job, spec) for spec in job.clients]
         for client in self._clients:
             client.join()
@@ -234,11 +241,11 @@ class StateClients(Plugin):
 
     def poll(self) -> None:
         """Send the samples that are due, and receive."""
-        now = self.job.session_time_ns()
+        now = self._job.session_time_ns()
         for client in self._clients:
             client.step(now)
         wake = min(now + round(POLL_S * 1e9), *(client.next_ns for client in self._clients))
-        self._group.poll(max(0.0, (wake - self.job.session_time_ns()) * 1e-9))
+        self._group.poll(max(0.0, (wake - self._job.session_time_ns()) * 1e-9))
         for client in self._clients:
             client.receive()
 
@@ -247,13 +254,13 @@ class StateClients(Plugin):
         for client in self._clients:
             client.prepare((end_ns - begin_ns) * 1e-9)
         cpu_s = time.process_time()
-        while (now := self.job.session_time_ns()) < end_ns:
+        while (now := self._job.session_time_ns()) < end_ns:
             for client in self._clients:
                 client.recording = begin_ns <= now
             self.poll()
         cpu_share = (time.process_time() - cpu_s) / ((end_ns - begin_ns) * 1e-9)
         share = {"cpu_share": np.array([cpu_share / len(self._clients)])}
-        self.job.write_log({client.spec.name: client.to_columns() | share for client in self._clients})
+        self._job.write_log({client.spec.name: client.to_columns() | share for client in self._clients})
 
     def close(self) -> None:
         """Leave the session."""

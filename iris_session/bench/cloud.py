@@ -6,15 +6,17 @@ pictures come at `BESIDE_HZ`, in every second of alternating intervals.
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from iris_session.bench.clients import ClientJob
-from iris_session.bench.cloud_camera import CloudCase, CloudJob
-from iris_session.bench.harness import CLIENTS, Action, BenchRun, group_clients, measure, plan_rounds
+import numpy as np
+
+from iris_session.bench.clients import ClientJob, make_operators
+from iris_session.bench.cloud_camera import CloudCase
+from iris_session.bench.cloud_stream import LEAD_S, WITH, plan_stream
+from iris_session.bench.harness import Action, BenchRun, measure
 from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchReport, make_bar
 from iris_session.demo.scenes import n_arms_scene
@@ -26,15 +28,7 @@ from iris_session.session.scene_publisher import ScenePublisher
 from iris_session.system.extras import require_package
 
 CAMERA: Final = "iris_session.bench.cloud_camera:CameraPublisher"
-MIN_HZ: Final = 30.0
-MIN_HZ_BESIDE: Final = 10.0
 BESIDE_HZ: Final = 15.0
-#: Late ticks that are allowed where there are fewer without a camera.
-LATE_SHARE: Final = 0.001
-#: Before the first interval, so that the camera has joined; and shortest interval [s].
-LEAD_S: Final = 1.0
-SHORTEST_S: Final = 0.5
-ROUNDS: Final = 4
 ROOM: Final = "room"
 
 
@@ -48,26 +42,16 @@ def run_cloud(
 ) -> BenchReport:
     """Make clouds of depth pictures, and send them.
 
-    Args:
-        points: Pixels of a cloud, shared by its cameras.
-        cameras: Number of cameras.
-        seconds: Length of the measured part, which the cases share.
-        seed: Random seed of noise and holes.
-        beside: Measure beside a session in which two arms are driven.
-        progress: Called with short texts.
-
-    Returns:
-        The report. Results are those of cells of 1 cm and 50,000 points; other cases are in objects of their own.
+    Results are those of cells of 1 cm and 50,000 points; other cases are in objects of their own.
     """
     require_package("numba", "bench cloud")
     require_package("cv2", "bench cloud")
     cases = _make_cases(points, cameras, beside, progress)
-    params: dict[str, Any] = {"points": points, "cameras": cameras, "seconds": seconds, "seed": seed, "beside": beside}
     progress("making the pictures")
-    with PluginProcess(CAMERA, CloudJob(cases, seed)) as camera:
+    with PluginProcess(CAMERA, cases, seed) as camera:
         camera.read()
         if beside:
-            return BenchReport("cloud", params, *_measure_beside(camera, seconds, seed, progress))
+            return _measure_beside(camera, seconds, seed, progress)
         with ScenePublisher(
             SceneBuilder("bench"), SessionConfig(control_port=0, state_port=0, record=False)
         ) as session:
@@ -81,9 +65,9 @@ def run_cloud(
         if compared["open3d_voxel_ms"] is None:
             progress("open3d cannot be imported: pip install 'iris-session[open3d]', and libusb-1.0-0 of the system")
         results = {**found.pop(ROOM), **compared, **found}
-    bars = [make_bar(results, "hz", ">=", MIN_HZ)]
-    bars += [make_bar(results, f"{name}.hz", ">=", MIN_HZ) for name in found]
-    return BenchReport("cloud", params, results, tuple(bars))
+    bars = [make_bar(results, "hz", ">=", 30.0)]
+    bars += [make_bar(results, f"{name}.hz", ">=", 30.0) for name in found]
+    return BenchReport(results, bars)
 
 
 def _make_cases(points: int, cameras: int, beside: bool, progress: Callable[[str], None]) -> tuple[CloudCase, ...]:
@@ -101,11 +85,9 @@ def _make_cases(points: int, cameras: int, beside: bool, progress: Callable[[str
 # --- beside a session -------------------------------------------------------------------------------------------------
 
 
-def _measure_beside(
-    camera: PluginProcess, seconds: float, seed: int, progress: Callable[[str], None]
-) -> tuple[dict[str, Any], tuple[Any, ...]]:
-    """Return results and bars of intervals with and without clouds."""
-    plan = plan_rounds(("without", "with"), seconds, ROUNDS, SHORTEST_S, LEAD_S)  # without a camera first
+def _measure_beside(camera: PluginProcess, seconds: float, seed: int, progress: Callable[[str], None]) -> BenchReport:
+    """Return the report of intervals with and without clouds."""
+    plan = plan_stream(seconds)  # without a camera first
     readings: list[PacerStats] = []  # at the end of the lead and of each interval
 
     def read_ticks(run: BenchRun) -> None:
@@ -115,14 +97,12 @@ def _measure_beside(
 
     actions: list[Action] = [(0.0, lambda run: camera.send("connect", run.session.address)), (LEAD_S, read_ticks)]
     for one in plan:
-        if one.kind == "with":
+        if one.kind == WITH:
             actions.append((one.begin_s, lambda _: camera.send("run", ROOM, plan[0].length_s)))
         actions.append((one.end_s, read_ticks))
-    arms = arm_names(2)
-    people = [ClientJob(f"operator{i}", "operator", arm, samples=True) for i, arm in enumerate(arms)]
     got = measure(
         n_arms_scene(2).compile(),
-        {CLIENTS: group_clients([*people, ClientJob("observer", "observer")])},
+        [*make_operators(arm_names(2)), ClientJob("observer", "observer")],
         plan[-1].end_s + 0.2,
         seed=seed,
         actions=actions,
@@ -130,20 +110,16 @@ def _measure_beside(
     )
     camera.read()  # the answer to `connect`
     runs = [camera.read() for _ in plan[1::2]]
-    late = {"": 0, "_without": 0}
-    ticks = {"": 0, "_without": 0}
-    for number, (before, after) in enumerate(itertools.pairwise(readings)):
-        key = "" if number % 2 else "_without"
-        late[key] += after.late - before.late
-        ticks[key] += after.ticks - before.ticks
-    worst = min(runs, key=lambda run: float(run["hz"]))
+    counts = np.diff([(stats.late, stats.ticks) for stats in readings], axis=0)
+    late, ticks = counts.reshape(-1, 2, 2).sum(axis=0).T.tolist()  # without and with a camera
     results = {
-        **worst,
-        **{f"late_tick_share{key}": round(late[key] / max(1, ticks[key]), 6) for key in late},
-        "ticks": sum(ticks.values()),
+        **min(runs, key=lambda run: float(run["hz"])),  # the worst
+        "late_tick_share": round(late[1] / max(1, ticks[1]), 6),
+        "late_tick_share_without": round(late[0] / max(1, ticks[0]), 6),
+        "ticks": sum(ticks),
         "rounds": len(runs),
         **got.summarize("late_causes", "scheduling", "drops"),
     }
-    bound = max(LATE_SHARE, results["late_tick_share_without"])
-    bars = (make_bar(results, "hz", ">=", MIN_HZ_BESIDE), make_bar(results, "late_tick_share", "<=", bound))
-    return results, bars
+    bound = max(0.001, results["late_tick_share_without"])
+    bars = (make_bar(results, "hz", ">=", 10.0), make_bar(results, "late_tick_share", "<=", bound))
+    return BenchReport(results, bars)

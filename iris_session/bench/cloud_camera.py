@@ -6,24 +6,26 @@ They show a room with tables and boxes, rendered by intersecting rays, with the 
 from __future__ import annotations
 
 import importlib
+import itertools
 import math
 import os
 import time
 from collections import defaultdict
 from pathlib import Path
 from statistics import median
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import cv2
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from anchors.camera import CameraModel
+from anchors.camera import CameraModel, parse_camera
 from iris_session.bench.cloud_stream import STREAM, MediaPublisher
 from iris_session.cloud.camera_file import CameraSettings, CloudSettings
 from iris_session.cloud.frames import DepthFrame, SourceFrame
 from iris_session.cloud.pipeline import Cloud, CloudPipeline, PlacedFrame
+from iris_session.cloud.sources.folder import FolderSource
 from iris_session.cloud.voxels import DepthLimits, pack_keys
 
 #: Inner corners of the room; boxes in it: low corner, high corner, red, green, blue [m].
@@ -52,24 +54,16 @@ HOLES: Final = 0.02
 PATCHES: Final = 60
 
 
-class RoomPicture(NamedTuple):
-    """A depth picture [mm], its colours, and the pose of its camera (4, 4)."""
-
-    depth: NDArray[np.uint16]
-    color: NDArray[np.uint8]
-    T_world_camera: NDArray[np.float64]
-
-
 def make_room_camera(width: int, height: int) -> CameraModel:
     """Return a camera of that size with a field of view of 70 degrees."""
     focal = 0.5 * width / math.tan(math.radians(35.0))
     return CameraModel(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
 
 
-def make_room_pose(angle: float, height_m: float = 1.5) -> NDArray[np.float64]:
+def make_room_pose(angle: float) -> NDArray[np.float64]:
     """Return the pose of a camera at an angle around the table, which looks at it."""
     target = np.array((0.7, 0.0, 0.7))
-    place = np.array((0.7 - 1.5 * math.cos(angle), 1.5 * math.sin(angle), height_m))
+    place = np.array((0.7 - 1.5 * math.cos(angle), 1.5 * math.sin(angle), 1.5))
     forward = (target - place) / np.linalg.norm(target - place)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -79,14 +73,8 @@ def make_room_pose(angle: float, height_m: float = 1.5) -> NDArray[np.float64]:
     return pose
 
 
-def render_room(camera: CameraModel, T_world_camera: NDArray[np.float64], seed: int) -> RoomPicture:
-    """Render the room for a camera without lens distortion.
-
-    Args:
-        camera: Its intrinsics.
-        T_world_camera: Its pose.
-        seed: Of noise and holes.
-    """
+def render_room(camera: CameraModel, T_world_camera: NDArray[np.float64], seed: int) -> DepthFrame:
+    """Render the room for a camera without lens distortion. `seed`: of noise and holes."""
     random = np.random.default_rng(seed)
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=2)
@@ -112,27 +100,23 @@ def render_room(camera: CameraModel, T_world_camera: NDArray[np.float64], seed: 
     z[random.random(z.shape, np.float32) < HOLES] = 0.0
     for row, column in random.integers(0, z.shape, (PATCHES, 2)):
         z[row : row + camera.height // 40, column : column + camera.width // 40] = 0.0
-    return RoomPicture(np.clip(np.rint(z * 1000.0), 0, 65_535).astype(np.uint16), color, T_world_camera)
+    return DepthFrame(np.clip(np.rint(z * 1000.0), 0, 65_535).astype(np.uint16), color, 0, T_world_camera)
 
 
 # --- the camera process -----------------------------------------------------------------------------------------------
 
 
 STAGES: Final = ("read", "voxels", "outliers", "budget", "encode", "send")
-ERROR_M: Final = 0.01
 #: Pictures of each camera, shown again and again.
 CYCLE: Final = 4
 #: Clouds before the measured ones: compilation, and the edge of the cells that meets the budget.
 WARM_UP: Final = 6
-REPEATS: Final = 5
 
 
 class CloudCase(msgspec.Struct, frozen=True):
     """One case.
 
     Attributes:
-        name: Its name.
-        cameras: Number of cameras.
         pixels: Pixels of a cloud, shared by its cameras; 0 for the recorded frames.
         points: Budget of points.
         voxel_m: Least edge of the cells [m].
@@ -147,23 +131,11 @@ class CloudCase(msgspec.Struct, frozen=True):
     hz: float = 0.0
 
 
-class CloudJob(msgspec.Struct, frozen=True):
-    """Cases of one process. `seed`: of the noise of the pictures."""
-
-    cases: tuple[CloudCase, ...]
-    seed: int
-
-
-class Rig(msgspec.Struct, frozen=True):
-    """The cameras of a case: intrinsics, limits, and for each camera its pictures."""
-
-    model: CameraModel
-    limits: DepthLimits
-    pictures: list[list[RoomPicture]]
+Rig = tuple[CameraModel, DepthLimits, list[list[DepthFrame]]]
 
 
 def make_rig(case: CloudCase, seed: int) -> Rig:
-    """Make the pictures of a case."""
+    """Return the intrinsics and limits of the cameras of a case, and for each camera its pictures."""
     if not case.pixels:
         return _load_recorded_rig(case)
     width = max(32, 8 * round(math.sqrt(case.pixels / case.cameras * 16.0 / 9.0) / 8.0))
@@ -176,27 +148,18 @@ def make_rig(case: CloudCase, seed: int) -> Rig:
         ]
         for number, angle in enumerate(np.linspace(0.0, 1.2, case.cameras).tolist())
     ]
-    return Rig(model, limits, pictures)
+    return model, limits, pictures
 
 
 def _load_recorded_rig(case: CloudCase) -> Rig:
     """Load the recorded frames; each further camera begins some frames later in the recording."""
     folder = Path(os.environ["IRIS_DATA"]) / "rgbd"
-    matrix = np.loadtxt(folder / "camera-intrinsics.txt")
-    files = sorted(folder.glob("*.depth.png"))[: CYCLE + case.cameras - 1]
-    pictures = [_load_picture(file) for file in files]
-    height, width = pictures[0].depth.shape
-    model = CameraModel(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    return Rig(model, DepthLimits(farthest_m=3.5), [pictures[i : i + CYCLE] for i in range(case.cameras)])
-
-
-def _load_picture(file: Path) -> RoomPicture:
-    stem = str(file).removesuffix(".depth.png")
-    depth, color = cv2.imread(str(file), cv2.IMREAD_UNCHANGED), cv2.imread(f"{stem}.color.jpg")
-    assert depth is not None, file
-    assert color is not None, file
-    rgb = np.ascontiguousarray(color[:, :, ::-1], np.uint8)
-    return RoomPicture(depth.astype(np.uint16), rgb, np.loadtxt(f"{stem}.pose.txt"))
+    model = parse_camera((folder / "camera-intrinsics.txt").read_text(), 640, 480)
+    settings = CameraSettings(name="recorded", source="folder", path=str(folder), intrinsics=model)
+    source = FolderSource(settings, itertools.count(0, 10**9).__next__)  # a frame is due whenever it is read
+    frames = [source.read(0.0) for _ in range(CYCLE + case.cameras - 1)]
+    pictures = [frame for frame in frames if frame is not None]
+    return model, DepthLimits(farthest_m=3.5), [pictures[i : i + CYCLE] for i in range(case.cameras)]
 
 
 class CloudCamera:
@@ -204,20 +167,17 @@ class CloudCamera:
 
     def __init__(self, case: CloudCase, seed: int) -> None:
         self.case = case
-        self.rig = make_rig(case, seed)
-        names = [f"camera{i}" for i in range(case.cameras)]
-        low, high, nearest_m, farthest_m, _ = self.rig.limits
+        self.model, self.limits, pictures = make_rig(case, seed)
+        self.pictures = {f"camera{i}": own for i, own in enumerate(pictures)}
+        low, high, nearest_m, farthest_m, _ = self.limits
         cameras = tuple(
-            CameraSettings(
-                name=name, source="folder", nearest_m=nearest_m, farthest_m=farthest_m, error_mm=1e3 * ERROR_M
-            )
-            for name in names
+            CameraSettings(name=name, source="folder", nearest_m=nearest_m, farthest_m=farthest_m, error_mm=10.0)
+            for name in self.pictures
         )
         settings = CloudSettings(
             stream=STREAM, points=case.points, voxel_m=case.voxel_m, low=low, high=high, cameras=cameras
         )
         self._pipeline = CloudPipeline(settings, time.perf_counter_ns)
-        self._names = names
         self._next = 0
         for _ in range(WARM_UP):
             self.make_cloud(0)
@@ -226,10 +186,11 @@ class CloudCamera:
         """Make a cloud of the next pictures. Return it, and the duration of their copying [ms]."""
         began_ns = time.perf_counter_ns()
         frames = {}
-        for name, pictures in zip(self._names, self.rig.pictures, strict=True):
-            depth, color, pose = pictures[self._next % len(pictures)]
+        for name, pictures in self.pictures.items():
+            depth, color, _, pose = pictures[self._next % len(pictures)]
+            assert pose is not None
             frame = DepthFrame(depth.copy(), color.copy(), now_ns)
-            frames[name] = PlacedFrame(SourceFrame(frame, self.rig.model, 0.001), pose)
+            frames[name] = PlacedFrame(SourceFrame(frame, self.model, 0.001), pose)
         self._next += 1
         read_ms = (time.perf_counter_ns() - began_ns) * 1e-6
         return self._pipeline.make_cloud(frames), read_ms
@@ -238,17 +199,15 @@ class CloudCamera:
 class CameraPublisher(MediaPublisher):
     """Publisher of the clouds of its cases."""
 
-    job_type = CloudJob
     role = "camera"
 
-    def __init__(self, job: CloudJob) -> None:
-        super().__init__(job)
-        self._cameras = {case.name: CloudCamera(case, job.seed) for case in job.cases}
+    def __init__(self, cases: tuple[CloudCase, ...], seed: int) -> None:
+        super().__init__()
+        self._cameras = {case.name: CloudCamera(case, seed) for case in cases}
 
     def compare(self) -> dict[str, float | None]:
         """Return what the voxel filters of numpy and open3d take for a picture of the first case [ms]."""
-        case = self.job.cases[0]
-        return compare_filters(self._cameras[case.name].rig, case.voxel_m)
+        return compare_filters(next(iter(self._cameras.values())))
 
     def run(self, case: str, seconds: float) -> dict[str, Any]:
         """Make and send clouds of a case for some seconds. Return the results."""
@@ -286,13 +245,14 @@ class CameraPublisher(MediaPublisher):
         }
 
 
-def compare_filters(rig: Rig, voxel_m: float) -> dict[str, float | None]:
+def compare_filters(cameras: CloudCamera) -> dict[str, float | None]:
     """Return what the voxel filters of numpy and open3d take for a picture [ms].
 
     Both get points that lie in memory, cropped, with colours, so that they deproject nothing and leave out no outliers.
     """
-    depth, color, pose = rig.pictures[0][0]
-    camera, limits = rig.model, rig.limits
+    depth, color, _, pose = cameras.pictures["camera0"][0]
+    assert pose is not None
+    camera, limits, voxel_m = cameras.model, cameras.limits, cameras.case.voxel_m
     v, u = np.nonzero((depth > 0) & (depth < 0xFFFF) & (depth <= limits.farthest_m * 1000.0))
     z = depth[v, u] * 0.001
     points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
@@ -324,7 +284,7 @@ def _time_open3d_ms(points: NDArray[Any], colors: NDArray[Any], voxel_m: float) 
 
 def _time_ms(call: Any) -> float:
     spent = []
-    for _ in range(REPEATS):
+    for _ in range(5):
         began = time.perf_counter()
         call()
         spent.append((time.perf_counter() - began) * 1e3)

@@ -15,11 +15,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.bench.clients import ClientJob
+from iris_session.bench.clients import MEDIA_CLIENTS, ClientJob, make_curve_keys
 from iris_session.bench.harness import (
     Action,
     BenchRun,
@@ -28,18 +27,17 @@ from iris_session.bench.harness import (
     Measurement,
     compute_age_p99_ms,
     measure,
-    plan_intervals,
     plan_rounds,
+    select_between,
 )
 from iris_session.bench.media_clients import UNCHECKED, sum_counts
 from iris_session.bench.media_clients import MediaColumn as Column
 from iris_session.bench.plugins import POLL_S, Plugin, PluginProcess
-from iris_session.bench.report import Bar, BenchError, BenchReport, compute_percentile, make_bar
-from iris_session.client import Client, CurveKeys
+from iris_session.bench.report import Bar, BenchError, BenchReport, allow_increase, make_bar, summarize_percentiles
+from iris_session.client import Client
 from iris_session.client.errors import NotConnectedError
 from iris_session.cloud.pipeline import CLASSES
 from iris_session.demo.scenes import free_bodies_scene
-from iris_session.netsim.process import make_link_address
 from iris_session.streams.cloud import decode_cloud, encode_cloud, order_points, read_header
 from iris_session.system.priority import lower_thread_priority
 
@@ -53,14 +51,6 @@ _WAVE: Final = 2.0
 #: Red, green, blue of the walls and the floor.
 _PAINT: Final = np.array(((215, 210, 200), (190, 200, 215), (130, 110, 90)))
 _LOW, _HIGH = np.array(((-2.0, -2.0, 0.0), (2.0, 2.0, 2.4)), np.float32)
-
-
-class SourceJob(msgspec.Struct, frozen=True):
-    """Job of the source. `seed`: of the points."""
-
-    points: int
-    hz: int
-    seed: int
 
 
 class MovingCloud:
@@ -94,14 +84,13 @@ class MediaPublisher(Plugin):
 
     role: ClassVar[str]
 
-    def __init__(self, job: Any) -> None:
-        super().__init__(job)
+    def __init__(self) -> None:
         lower_thread_priority()  # of this thread and those that it starts, as in a camera process
         self._client: Client | None = None
 
     def connect(self, address: str, *keys: str) -> None:
         """Join a session, with the keys of an encrypted one."""
-        curve = CurveKeys(*(key.encode() for key in keys)) if keys else None
+        curve = make_curve_keys(keys)
         self._client = Client(address, role=self.role, name=self.role, alignment="not_needed", curve=curve)
         self._client.connect(30.0)
         nothing = encode_cloud(np.empty((0, 3)), np.empty((0, 3), np.uint8))
@@ -135,17 +124,16 @@ class MediaPublisher(Plugin):
 class Source(MediaPublisher):
     """Publisher of a moving cloud."""
 
-    job_type = SourceJob
     role = "source"
 
-    def __init__(self, job: SourceJob) -> None:
-        super().__init__(job)
-        self._cloud = MovingCloud(job.points, job.seed)
+    def __init__(self, points: int, hz: int, seed: int) -> None:
+        super().__init__()
+        self._cloud, self._hz = MovingCloud(points, seed), hz
 
     def run(self, seconds: float) -> dict[str, Any]:
         """Publish for some seconds. Return captures [ns] of the frames by number, and what their encoding took [ms]."""
         assert self._client is not None
-        hz: int = self.job.hz
+        hz = self._hz
         captures: dict[int, int] = {}
         encode_ms, refused = [], 0
         begin = time.perf_counter()
@@ -170,27 +158,20 @@ class Source(MediaPublisher):
 
 
 SOURCE: Final = "iris_session.bench.cloud_stream:Source"
-CLIENTS: Final = "iris_session.bench.media_clients:CloudClients"
 #: Moving rigid bodies beside the cloud.
 BODIES: Final = 50
-ROUNDS: Final = 4
 #: Before the first interval, so that the source has joined; and shortest interval [s].
 LEAD_S: Final = 1.0
 SHORTEST_S: Final = 0.5
 #: From the fall of the bandwidth to the coarser class at every client [s].
 MAX_LOWER_S: Final = 1.0
-MAX_BYTES: Final = 9.1
-MAX_DECODE_MS: Final = 0.2
 WITHOUT, WITH, SLOW, SLOW_WITHOUT = "without", "with", "slow", "slow_without"
-MS: Final = 1e-6
 
 
-def plan_stream(seconds: float, mbit: float) -> list[Interval]:
-    """Return the intervals of a window."""
-    if not mbit:
-        return plan_rounds((WITHOUT, WITH), seconds, ROUNDS, SHORTEST_S, LEAD_S)
-    kinds = (WITH, SLOW, SLOW_WITHOUT)
-    return plan_intervals(kinds, max(SHORTEST_S, (seconds - LEAD_S) / len(kinds)), LEAD_S)
+def plan_stream(seconds: float, *, slow: bool = False) -> list[Interval]:
+    """Return the intervals of a window, `slow`: in whose middle links become slow."""
+    kinds, rounds = ((WITH, SLOW, SLOW_WITHOUT), 1) if slow else ((WITHOUT, WITH), 4)
+    return plan_rounds(dict.fromkeys(kinds, SHORTEST_S), seconds, rounds, LEAD_S)
 
 
 def run_cloud_stream(
@@ -203,52 +184,33 @@ def run_cloud_stream(
     curve: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """Stream a cloud to observers, beside 50 rigid bodies.
-
-    Args:
-        points: Points of the cloud.
-        hz: Clouds per second.
-        clients: Number of observers, each in a process of its own.
-        seconds: Length of the measured window.
-        mbit: Bandwidth to which the link of every client falls [Mbit/s]; 0 for no links.
-        seed: Random seed.
-        curve: Encrypt and authenticate.
-        progress: Called with short texts.
-    """
-    plan = plan_stream(seconds, mbit)
-    specs = [ClientJob(f"client{i}", "observer") for i in range(clients)]
-    links: dict[str, str] = {}
-    if mbit:
-        specs = [msgspec.structs.replace(spec, link=make_link_address(i)) for i, spec in enumerate(specs)]
-        links = {spec.link: "none" for spec in specs}
+    """Stream a cloud to observers, beside 50 rigid bodies."""
+    plan = plan_stream(seconds, slow=mbit > 0.0)
+    link = "none" if mbit else ""
+    specs = [
+        ClientJob(f"client{i}", "observer", profile=link, plugin=MEDIA_CLIENTS, alone=True) for i in range(clients)
+    ]
     with (
         tempfile.TemporaryDirectory(prefix="iris-bench-") as folder,
-        PluginProcess(SOURCE, SourceJob(points, hz, seed)) as source,
+        PluginProcess(SOURCE, points, hz, seed) as source,
     ):
         source.read()
         profile = Path(folder) / "slow.json"
         profile.write_text(json.dumps({"phases": [{"rate_mbit": mbit, "delay_ms": 2}]}))
 
         def connect(run: BenchRun) -> None:
-            job = run.processes[0].job
-            keys = [job.server_public, job.public, job.secret] if job.server_public else []
-            source.send("connect", run.session.address, *keys)
-
-        def slow_links(run: BenchRun) -> None:
-            assert run.proxy is not None
-            run.proxy.send(f"profile {profile}")
+            source.send("connect", run.session.address, *run.processes[0].job.keys)
 
         actions: list[Action] = [(0.0, connect)]
         for one in plan:
             if one.kind == SLOW:
-                actions.append((one.begin_s, slow_links))
+                actions.append((one.begin_s, lambda run: run.command_links(f"profile {profile}")))
             if one.kind in (WITH, SLOW):
                 actions.append((one.begin_s, lambda _: source.send("run", plan[0].length_s)))
         got = measure(
             free_bodies_scene(BODIES, seed).compile(),
-            {CLIENTS: [(spec,) for spec in specs]},
+            specs,
             plan[-1].end_s,
-            links=links,
             seed=seed,
             actions=actions,
             curve=curve,
@@ -259,9 +221,8 @@ def run_cloud_stream(
         runs = [source.read() for one in plan if one.kind in (WITH, SLOW)]
     progress("comparing the delivered clouds with those of the source")
     results = summarize(got, plan, runs, MovingCloud(points, seed), hz)
-    params: dict[str, Any] = {"points": points, "hz": hz, "clients": clients, "seconds": plan[-1].end_s}
-    params |= {"seed": seed, "curve": curve, "mbit": mbit, "bodies": BODIES}
-    return BenchReport("cloud-stream", params, results, tuple(_make_bars(results, hz, mbit)))
+    params = {"seconds": plan[-1].end_s, "bodies": BODIES}
+    return BenchReport(results, _make_bars(results, hz, mbit), params=params)
 
 
 def summarize(
@@ -279,19 +240,15 @@ def summarize(
     length_s = sum(one.length_s for one in streamed)
     counts, heads = sum_counts(logs)
     whole = clouds[clouds[:, Column.LEVEL] == 0]
-    encode_ms = np.concatenate([run["encode_ms"] for run in runs])
     errors_m, stated_m = _compare(clouds, runs, cloud, hz)
     results: dict[str, Any] = {
         "delivered_hz_min": round(min(len(one) for one in fast) / length_s, 2),
         "bytes_per_point": round(
             (whole[:, Column.SIZE].mean() + heads / len(clouds)) / whole[:, Column.POINTS].mean(), 4
         ),
-        "age_ms_p50": compute_percentile((rows[:, Column.HANDED] - rows[:, Column.CAPTURE]) * MS, 50),
-        "age_ms_p99": compute_percentile((rows[:, Column.HANDED] - rows[:, Column.CAPTURE]) * MS, 99),
-        "encode_ms_p50": compute_percentile(encode_ms, 50),
-        "encode_ms_p99": compute_percentile(encode_ms, 99),
-        "decode_ms_p50": compute_percentile(whole[:, Column.DECODED] * MS, 50),
-        "decode_ms_p99": compute_percentile(whole[:, Column.DECODED] * MS, 99),
+        **summarize_percentiles("age_ms", (rows[:, Column.HANDED] - rows[:, Column.CAPTURE]) * 1e-6),
+        **summarize_percentiles("encode_ms", np.concatenate([run["encode_ms"] for run in runs])),
+        **summarize_percentiles("decode_ms", whole[:, Column.DECODED] * 1e-6),
         "max_error_mm": round(errors_m * 1e3, 5),
         "stated_error_mm": round(stated_m * 1e3, 5),
         "mbit_per_s": round(float(whole[:, Column.SIZE].mean()) * 8e-6 * hz, 1),
@@ -341,7 +298,7 @@ def _first(times_s: NDArray[Any]) -> float:
 
 def _make_bars(results: dict[str, Any], hz: int, mbit: float) -> list[Bar]:
     bars = [
-        make_bar(results, "bytes_per_point", "<=", MAX_BYTES),
+        make_bar(results, "bytes_per_point", "<=", 9.1),
         make_bar(results, "max_error_mm", "<=", results["stated_error_mm"]),
     ]
     if mbit:
@@ -350,10 +307,9 @@ def _make_bars(results: dict[str, Any], hz: int, mbit: float) -> list[Bar]:
         key, without = "state_age_ms_p99_slow_lowered", "state_age_ms_p99_slow_without"
     else:
         bars.append(make_bar(results, "delivered_hz_min", ">=", hz * 58.0 / 60.0))
-        bars.append(make_bar(results, "decode_ms_p50", "<", MAX_DECODE_MS))
+        bars.append(make_bar(results, "decode_ms_p50", "<", 0.2))
         key, without = "state_age_ms_p99", "state_age_ms_p99_without"
-    alone = results[without]
-    return [*bars, make_bar(results, key, "<=", round(alone + max(0.2 * alone, 1.0), 3))]
+    return [*bars, make_bar(results, key, "<=", allow_increase(results[without]))]
 
 
 # --- evaluation -------------------------------------------------------------------------------------------------------
@@ -361,7 +317,7 @@ def _make_bars(results: dict[str, Any], hz: int, mbit: float) -> list[Bar]:
 
 def _select(rows: NDArray[Any], column: int, got: Measurement, interval: Interval) -> NDArray[Any]:
     """Return the rows with a session time within an interval."""
-    return np.asarray(rows[interval.contains(rows[:, column], got.begin_ns)])
+    return np.asarray(rows[select_between(rows[:, column], got.begin_ns, interval.begin_s, interval.end_s)])
 
 
 def _compare(clouds: NDArray[Any], runs: Sequence[dict[str, Any]], cloud: MovingCloud, hz: int) -> tuple[float, float]:

@@ -18,13 +18,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.bench.clients import ClientJob, Job
-from iris_session.bench.harness import BROWSERS, CLIENTS, Group, Log, measure
+from iris_session.bench.clients import BROWSERS, ClientJob, Job
+from iris_session.bench.harness import Log, compute_ages_ms, measure
+from iris_session.bench.join import split_quads
 from iris_session.bench.plugins import Plugin
-from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar
+from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, summarize_percentiles
+from iris_session.bench.state import compute_pose_errors
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.codec import encode_presence, encode_server, encode_state_header
 from iris_session.protocol.common import Applied, Pose
@@ -47,8 +50,6 @@ from iris_session.streams.rigid import RigidDecoder, RigidEncoder
 from iris_session.system.extras import require_package
 from iris_session.system.process import ROOT, module_command
 
-#: In which a client ends after its input [s].
-EXIT_S: Final = 5.0
 RUNTIMES: Final = ("dotnet", "mono")
 CSHARP_CLIENTS: Final = "iris_session.bench.csharp:CsharpClient"
 #: Beside them: the Python client, which has no gateway between, and one over the same WebSocket.
@@ -65,7 +66,7 @@ CLOTH_SIDE: Final = 30
 CLOTH_BOUND_M: Final = 0.0005
 CLOUDS: Final = 8
 #: Time in which a runtime decodes all frames [s].
-PATIENCE_S: Final = 300.0
+DECODE_S: Final = 300.0
 _INT: Final = struct.Struct("<i")
 Floats = NDArray[np.float64]
 
@@ -79,14 +80,6 @@ def run_csharp(
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
     """Decode many frames after the first ones; then receive the state of a session, behind its web gateway.
-
-    Args:
-        bodies: Number of moving bodies.
-        points: Points of the cloud.
-        seed: Random seed.
-        frames: Frames that count, after the first `WARM_UP`.
-        seconds: Length of the window in which state is received.
-        progress: Called with short texts.
 
     Returns:
         The report: the worse of both runtimes, and each by itself. Reference: the decoders of the Python client, and
@@ -120,9 +113,7 @@ def run_csharp(
         make_bar(results, "cloth_max_error_mm", "<=", CLOTH_BOUND_M * 1e3),
         make_bar(results, "age_ms_p99", "<=", reference[f"{PYTHON_WEB}_age_ms_p99"]),
     ]
-    params = {"bodies": bodies, "points": points, "vertices": CLOTH_SIDE**2, "frames": frames, "seconds": seconds}
-    params |= {"seed": seed}
-    return BenchReport("csharp", params, results, tuple(bars), reference)
+    return BenchReport(results, bars, reference, {"vertices": CLOTH_SIDE**2, "frames": frames})
 
 
 def _measure_ages(
@@ -131,12 +122,9 @@ def _measure_ages(
     """Return the age of state at clients of one session, by their names."""
     for package in ("aiohttp", "cryptography"):
         require_package(package, "bench csharp")
-    groups: dict[str, list[Group]] = {
-        CLIENTS: [(ClientJob(PYTHON, "observer"),)],
-        BROWSERS: [(ClientJob(PYTHON_WEB, "observer"),)],
-        CSHARP_CLIENTS: [(ClientJob(runtime, "observer"),) for runtime in RUNTIMES],
-    }
-    got = measure(free_bodies_scene(bodies, seed).compile(), groups, seconds, seed=seed, progress=progress)
+    clients = [ClientJob(PYTHON, "observer"), ClientJob(PYTHON_WEB, "observer", plugin=BROWSERS)]
+    clients += [ClientJob(runtime, "observer", plugin=CSHARP_CLIENTS, alone=True) for runtime in RUNTIMES]
+    got = measure(free_bodies_scene(bodies, seed).compile(), clients, seconds, seed=seed, progress=progress)
     return {name: _summarize_ages(name, log) for name, log in got.logs.items()}
 
 
@@ -144,8 +132,7 @@ def _summarize_ages(name: str, log: Log) -> dict[str, float]:
     """Return percentiles of the age of state when an application could have it [ms]."""
     if not len(log["ticks"]):
         raise BenchError(f"the client {name} received no state: increase --seconds")
-    ages = (log["handed_ns"] - log["state_ns"]) * 1e-6
-    return {f"age_ms_p{q}": compute_percentile(ages, q) for q in (50, 99)}
+    return summarize_percentiles("age_ms", compute_ages_ms([log]))
 
 
 class _Frames:
@@ -161,11 +148,14 @@ class _Frames:
 
     def __init__(self, bodies: int, points: int, frames: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        motion = _Motion(rng, bodies)
+        model = free_bodies_scene(bodies, seed).compile()
+        model.opt.timestep = PERIOD_S
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
         topology = _make_cloth_topology()
         parts = [struct.pack("<4i", bodies, frames + WARM_UP, WARM_UP, SAMPLE)]
-        first = motion.compute_poses(0.0)
-        parts += map(_pack, (_welcome(), *_make_snapshot(first), topology.to_bytes()))
+        mujoco.mj_forward(model, data)
+        parts += map(_pack, (_welcome(), *_make_snapshot(_read_poses(data)), topology.to_bytes()))
         clouds = [_make_cloud(rng, points, k) for k in range(CLOUDS)]
         cloud_frames = [encode_cloud(*cloud)["full"] for cloud in clouds]
         self.last_cloud = decode_cloud(cloud_frames[(frames + WARM_UP - 1) % CLOUDS]).positions
@@ -174,7 +164,8 @@ class _Frames:
         rigid, rigid_decoder = RigidEncoder(bodies), RigidDecoder(bodies)
         cloth, cloth_decoder = DeformableEncoder(topology, CLOTH_BOUND_M), DeformableDecoder(topology)
         for i in range(frames + WARM_UP):
-            now = motion.compute_poses(i * PERIOD_S)
+            mujoco.mj_step(model, data)
+            now = _read_poses(data)
             sheet = _move_cloth(i * PERIOD_S)
             encoded = rigid.encode(now, 1)
             drawn = (cloth.encode(sheet) or {}).get("full", b"")
@@ -198,22 +189,9 @@ class _Frames:
         self.content = b"".join([*parts, b"rigid", b"presence"])
 
 
-class _Motion:
-    """Smooth motion of bodies around places in a room."""
-
-    def __init__(self, rng: np.random.Generator, bodies: int) -> None:
-        self._place = rng.uniform(-3.0, 3.0, (bodies, 3))
-        self._reach = rng.uniform(0.1, 0.5, (bodies, 3))
-        self._rate = rng.uniform(0.5, 4.0, (bodies, 3))
-        axis = rng.normal(size=(bodies, 3))
-        self._axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
-        self._spin = rng.uniform(-3.0, 3.0, (bodies, 1))
-
-    def compute_poses(self, t: float) -> Floats:
-        """Return rows `x y z qw qx qy qz` at a time [s]."""
-        position = self._place + self._reach * np.sin(self._rate * t)
-        half = 0.5 * self._spin * t
-        return np.hstack([position, np.cos(half), np.sin(half) * self._axis])
+def _read_poses(data: mujoco.MjData) -> Floats:
+    """Return rows `x y z qw qx qy qz` of all bodies but the world."""
+    return np.hstack([data.xpos[1:], data.xquat[1:]])
 
 
 def _pack(data: bytes) -> bytes:
@@ -259,10 +237,8 @@ def _make_presence(i: int) -> Presence:
 
 
 def _make_cloth_topology() -> DeformableTopology:
-    corner = np.arange(CLOTH_SIDE**2).reshape(CLOTH_SIDE, CLOTH_SIDE)
-    a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    return DeformableTopology(CLOTH_SIDE**2, faces)
+    corners = np.arange(CLOTH_SIDE**2).reshape(CLOTH_SIDE, CLOTH_SIDE)
+    return DeformableTopology(CLOTH_SIDE**2, split_quads(corners))
 
 
 def _move_cloth(t: float) -> Floats:
@@ -282,20 +258,17 @@ def _decode(made: _Frames, runtime: str, file: Path, out: Path) -> dict[str, flo
     command = [*make_command(runtime), "decode", str(file), str(out)]
     try:
         done = subprocess.run(
-            command, cwd=ROOT, env=make_environment(), capture_output=True, text=True, timeout=PATIENCE_S, check=False
+            command, cwd=ROOT, env=make_environment(), capture_output=True, text=True, timeout=DECODE_S, check=False
         )
     except subprocess.TimeoutExpired:
-        raise BenchError(f"{runtime} has not decoded the frames within {PATIENCE_S:g} s") from None
+        raise BenchError(f"{runtime} has not decoded the frames within {DECODE_S:g} s") from None
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
         raise BenchError(f"the C# decoders do not run on {runtime}: {lines[0] if lines else done.returncode}")
     got = json.loads(done.stdout)
     position, rotation, cloth, cloud = _measure_errors(made, out.read_bytes())
     return {
-        "decode_us_p50": got["decode_us_p50"],
-        "decode_us_p99": got["decode_us_p99"],
-        "cloth_us_p50": got["cloth_us_p50"],
-        "cloud_us_p50": got["cloud_us_p50"],
+        **{key: got[key] for key in ("decode_us_p50", "decode_us_p99", "cloth_us_p50", "cloud_us_p50")},
         "allocated_bytes_per_frame": got["allocated_bytes"] / got["frames"],
         "max_error_mm": position,
         "max_rotation_error_deg": rotation,
@@ -307,23 +280,15 @@ def _decode(made: _Frames, runtime: str, file: Path, out: Path) -> dict[str, flo
 def _measure_errors(made: _Frames, data: bytes) -> tuple[float, float, float, float]:
     """Return the largest errors of what C# decoded: positions [mm], rotations [deg], vertices [mm]; and by how much
     points differ from those of the Python decoder [mm]."""
-    n, bodies = made.poses.shape[:2]
-    size, drawn = 8 * n * bodies * 7, made.vertices.size * 4
-    poses = np.frombuffer(data, "<f8", count=size // 8).reshape(n, bodies, 7)
+    size, drawn = made.poses.size * 8, made.vertices.size * 4
+    poses = np.frombuffer(data, "<f8", count=made.poses.size).reshape(-1, 7)
     vertices = np.frombuffer(data, "<f4", count=made.vertices.size, offset=size).reshape(made.vertices.shape)
     points = np.frombuffer(data, "<f8", offset=size + drawn).reshape(-1, 3)
-    position = np.linalg.norm(poses[..., :3] - made.poses[..., :3], axis=-1).max()
-    dot = np.abs(np.einsum("nbi,nbi->nb", poses[..., 3:], made.poses[..., 3:]))
-    rotation = 2.0 * np.degrees(np.arccos(np.minimum(dot.min(), 1.0)))
+    position_mm, rotation_deg = compute_pose_errors(poses, made.poses.reshape(-1, 7))
     cloth = np.linalg.norm(vertices - made.vertices, axis=-1).max()
-    return (
-        round(float(position) * 1e3, 5),
-        round(float(rotation), 5),
-        round(float(cloth) * 1e3, 5),
-        round(float(np.abs(points - made.last_cloud).max()) * 1e3, 5)
-        if points.shape == made.last_cloud.shape
-        else math.inf,
-    )
+    cloud = np.abs(points - made.last_cloud).max() if points.shape == made.last_cloud.shape else math.inf
+    found = (position_mm, rotation_deg, cloth * 1e3, cloud * 1e3)
+    return tuple(round(float(value), 5) for value in found)  # type: ignore[return-value]
 
 
 # --- C# programs ---
@@ -342,10 +307,8 @@ def make_environment() -> dict[str, str]:
 class CsharpClient(Plugin):
     """One C# client on the runtime that its name is."""
 
-    job_type = Job
-
     def __init__(self, job: Job) -> None:
-        super().__init__(job)
+        self._job = job
         (spec,) = job.clients
         command = [*make_command(spec.name), "live", job.page, spec.name, str(job.origin_ns)]
         self._name = spec.name
@@ -357,20 +320,19 @@ class CsharpClient(Plugin):
     def measure(self, begin_ns: int, end_ns: int) -> None:
         """Let the client log a window of session time [ns], and write its log."""
         assert self._process.stdin is not None
-        with tempfile.TemporaryDirectory(prefix="iris-bench-") as folder:
-            file = Path(folder, "log")
-            self._process.stdin.write(f"measure {begin_ns} {end_ns} {file}\n")
-            self._process.stdin.flush()
-            self._expect("done")
-            rows = np.loadtxt(file, np.int64, ndmin=2).reshape(-1, 3)
-        self.job.write_log({self._name: dict(zip(("ticks", "handed_ns", "state_ns"), rows.T, strict=True))})
+        file = f"{self._job.log}.txt"
+        self._process.stdin.write(f"measure {begin_ns} {end_ns} {file}\n")
+        self._process.stdin.flush()
+        self._expect("done")
+        rows = np.loadtxt(file, np.int64, ndmin=2).reshape(-1, 3)
+        self._job.write_log({self._name: dict(zip(("ticks", "handed_ns", "state_ns"), rows.T, strict=True))})
 
     def close(self) -> None:
         """Let the client leave the session."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
-            self._process.wait(EXIT_S)
+            self._process.wait(5.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
 

@@ -8,34 +8,39 @@ kept in the user's cache folder: the first run with a seed takes that much longe
 from __future__ import annotations
 
 import math
-import os
 import tempfile
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import Log, Measurement, assign_links, group_clients, measure
+from iris_session.assets.store import default_root
+from iris_session.bench.clients import MEDIA_CLIENTS, ClientJob
+from iris_session.bench.harness import Log, Measurement, measure
 from iris_session.bench.media_clients import MediaColumn as Column
 from iris_session.bench.media_clients import sum_counts
-from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, make_link_report
+from iris_session.bench.report import (
+    BenchError,
+    BenchReport,
+    compute_percentile,
+    make_bar,
+    summarize_percentiles,
+)
 from iris_session.demo.scenes import free_bodies_scene
 from iris_session.protocol.names import BudgetClass
 from iris_session.session.session import Session
 from iris_session.streams.deformable import COARSER, DeformableDecoder, DeformableEncoder
 from iris_session.streams.deformable_topology import DeformableTopology
+from iris_session.system.files import Replacement
 
 STREAM: Final = "cloth"
-CLIENTS: Final = "iris_session.bench.media_clients:DeformableClients"
 BOUND_M: Final = 0.0005
 #: Moving rigid bodies beside the cloth.
 BODIES: Final = 50
@@ -54,33 +59,22 @@ def run_deformable(
 ) -> BenchReport:
     """Stream a cloth at 60 Hz to observers, beside 50 rigid bodies.
 
-    Args:
-        vertices: Vertices of the cloth, a square number.
-        clients: Number of observers.
-        seconds: Length of the measured window.
-        seed: Random seed.
-        curve: Encrypt and authenticate.
-        profile: Link profile of every client; bars do not apply then.
-        progress: Called with short texts.
-
-    Returns:
-        The report. Reference: the same frames as float32, and as float32 compressed by deflate.
+    Reference: the same frames as float32, and as float32 compressed by deflate.
     """
     side = math.isqrt(vertices)
     if side * side != vertices:
         raise BenchError(f"--vertices {vertices}: the cloth is square, choose {side * side} or {(side + 1) ** 2}")
     motion = load_cloth_motion(side, seed, progress)
-    topology = DeformableTopology(motion.n_vertices, motion.faces)
-    specs, links = assign_links([ClientJob(f"client{i}", "observer") for i in range(clients)], profile)
+    topology = DeformableTopology(vertices, motion.faces)
+    specs = [ClientJob(f"client{i}", "observer", profile=profile, plugin=MEDIA_CLIENTS) for i in range(clients)]
     source = _ClothSource(motion, topology)
     with tempfile.TemporaryDirectory(prefix="iris-bench-") as folder:
         file = Path(folder) / "topology"
         file.write_bytes(topology.to_bytes())
         got = measure(
             free_bodies_scene(BODIES, seed).compile(),
-            {CLIENTS: group_clients(specs)},
+            specs,
             seconds,
-            links=links,
             seed=seed,
             curve=curve,
             stream=STREAM,
@@ -97,16 +91,14 @@ def run_deformable(
         make_bar(results, "max_error_mm", "<=", 0.5),
         make_bar(results, "delivered_hz_min", ">=", 59.0),
     ]
-    params: dict[str, Any] = {"vertices": vertices, "clients": clients, "seconds": seconds, "seed": seed}
-    params |= {"curve": curve, "hz": HZ, "bound_mm": BOUND_M * 1e3}
-    return make_link_report("deformable", params, results, bars, profile, _measure_reference(motion))
+    return BenchReport(results, bars, _measure_reference(motion), {"hz": HZ, "bound_mm": BOUND_M * 1e3})
 
 
 class _ClothSource:
     """Publishes the motion from the session's loop, 60 frames a second, as the session does with deformables.
 
-    `frames`: index into the motion by `capture_ns`. `encoded`: session time, wall time [ns], processor time [ns] and
-    bytes of every frame.
+    `frames`: index into the motion and payload by `capture_ns`. `encoded`: session time, wall time [ns], processor time
+    [ns] and bytes of every frame.
     """
 
     def __init__(self, motion: ClothMotion, topology: DeformableTopology) -> None:
@@ -114,7 +106,7 @@ class _ClothSource:
         self._encoder = DeformableEncoder(topology, BOUND_M)
         self._begin_ns = -1
         self._next = 0
-        self.frames: dict[int, int] = {}
+        self.frames: dict[int, tuple[int, bytes]] = {}
         self.encoded: list[tuple[int, int, int, int]] = []
         self.refused = 0
 
@@ -127,15 +119,15 @@ class _ClothSource:
         if due < self._next:
             return
         self._next = due + 1  # frames for which the loop had no time are skipped
-        index = self.motion.frame_index(due)
-        vertices = self.motion.vertices(index)
+        index = self.motion.find_frame(due)
+        vertices = self.motion.vertices[index]
         wall_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         made = self._encoder.encode(vertices)
         wall_ns, cpu_ns = time.perf_counter_ns() - wall_ns, time.thread_time_ns() - cpu_ns
         size = 0 if made is None else len(made[BudgetClass.FULL])
         self.encoded.append((now_ns, wall_ns, cpu_ns, size))
         if made is not None:
-            self.frames[now_ns] = index
+            self.frames[now_ns] = index, made[BudgetClass.FULL]
             self.refused += not session.publish_media(STREAM, made, capture_ns=now_ns)
 
 
@@ -152,16 +144,13 @@ def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
     counts, heads = sum_counts(logs)
     sent = sizes.sum() + np.count_nonzero(sizes) * heads / len(ages)
     return {
-        "encode_ms_p50": compute_percentile(spent[:, 0], 50),
-        "encode_ms_p99": compute_percentile(spent[:, 0], 99),
+        **summarize_percentiles("encode_ms", spent[:, 0]),
         "mbit_per_s": round(float(sent) * 8e-6 / got.seconds, 3),
         "max_error_mm": round(_compute_max_error_m(got.logs, source) * 1e3, 5),
         "delivered_hz_min": round(min(len(log["frames"]) for log in logs) / got.seconds, 2),
-        "encode_cpu_ms_p50": compute_percentile(spent[:, 1], 50),
-        "encode_cpu_ms_p99": compute_percentile(spent[:, 1], 99),
+        **summarize_percentiles("encode_cpu_ms", spent[:, 1]),
         "decode_cpu_ms_p50": compute_percentile(decode, 50),
-        "age_ms_p50": compute_percentile(ages, 50),
-        "age_ms_p99": compute_percentile(ages, 99),
+        **summarize_percentiles("age_ms", ages),
         "bytes_per_frame": round(float(sizes[sizes > 0].mean()), 1),
         "frames_encoded": len(spent),
         "frames_refused": source.refused,
@@ -171,29 +160,19 @@ def _summarize(got: Measurement, source: _ClothSource) -> dict[str, Any]:
 
 
 def _compute_max_error_m(logs: dict[str, Log], source: _ClothSource) -> float:
-    """Return the largest error of all delivered vertices. Also check that clients decoded the same vertices."""
+    """Return the largest error of all delivered vertices. Also check that clients decoded what was sent."""
     decoder = DeformableDecoder(source.topology)
-    errors: dict[tuple[int, int], float] = {}  # by capture and checksum: the same frame goes to every client
-    worst = 0.0
+    found: dict[int, tuple[int, float]] = {}  # checksum and error by capture: the same frame goes to every client
     for name, log in logs.items():
-        for capture_ns, checksum, payload in _iterate_payloads(log):
-            key = (capture_ns, checksum)
-            if key not in errors:
+        for capture_ns, checksum in log["frames"][:, [Column.CAPTURE, Column.CHECKSUM]].tolist():
+            if capture_ns not in found:
+                index, payload = source.frames[capture_ns]
                 decoded = decoder.decode(payload)
-                if zlib.crc32(decoded.data) != checksum:
-                    raise BenchError(f"{name} decoded other vertices than its payload contains")
-                truth = source.motion.vertices(source.frames[capture_ns])
-                errors[key] = float(np.linalg.norm(decoded - truth, axis=1).max())
-            worst = max(worst, errors[key])
-    return worst
-
-
-def _iterate_payloads(log: Log) -> Iterator[tuple[int, int, bytes]]:
-    """Yield `capture_ns`, checksum and payload of every frame that one client decoded."""
-    ends = np.cumsum(log["frames"][:, Column.SIZE])
-    for row, end in zip(log["frames"].tolist(), ends.tolist(), strict=True):
-        payload = log["payloads"][end - row[Column.SIZE] : end].tobytes()
-        yield row[Column.CAPTURE], row[Column.CHECKSUM], payload
+                error_m = float(np.linalg.norm(decoded - source.motion.vertices[index], axis=1).max())
+                found[capture_ns] = zlib.crc32(decoded.data), error_m
+            if found[capture_ns][0] != checksum:
+                raise BenchError(f"{name} decoded other vertices than were sent")
+    return max(error_m for _, error_m in found.values())
 
 
 def _measure_offline(motion: ClothMotion, topology: DeformableTopology) -> dict[str, Any]:
@@ -202,31 +181,27 @@ def _measure_offline(motion: ClothMotion, topology: DeformableTopology) -> dict[
     for name in (BudgetClass.HALF, BudgetClass.QUARTER):
         encoder = DeformableEncoder(topology, BOUND_M)
         sizes = []
-        for index in range(0, len(motion.nodes), _SAMPLE):
+        for vertices in motion.vertices[::_SAMPLE]:
             encoder.reset()
-            made = encoder.encode(motion.vertices(index), (name,))
+            made = encoder.encode(vertices, (name,))
             assert made is not None
             sizes.append(len(made[name]))
         found[f"{name}_bound_mm"] = BOUND_M * COARSER[name] * 1e3
         found[f"{name}_mbit_per_s"] = round(float(np.mean(sizes)) * 8e-6 * HZ, 3)
-    pairs = range(0, len(motion.nodes) - 1, _SAMPLE)
-    steps = np.stack([motion.vertices(index + 1) - motion.vertices(index) for index in pairs])
-    speeds = np.linalg.norm(steps, axis=2) * HZ
-    found["vertex_speed_m_per_s_p50"] = compute_percentile(speeds, 50)
-    found["vertex_speed_m_per_s_p99"] = compute_percentile(speeds, 99)
-    return found
+    speeds = np.linalg.norm(np.diff(motion.vertices, axis=0)[::_SAMPLE], axis=2) * HZ
+    return found | summarize_percentiles("vertex_speed_m_per_s", speeds.ravel())
 
 
 def _measure_reference(motion: ClothMotion) -> dict[str, float]:
     """Return the bit rate of the same frames as float32, and as float32 compressed by deflate, level 1."""
     sizes, spent_ns = [], []
-    for index in range(0, len(motion.nodes), _SAMPLE):
-        raw = motion.vertices(index).astype("<f4").tobytes()
+    for vertices in motion.vertices[::_SAMPLE]:
+        raw = vertices.astype("<f4").tobytes()
         began_ns = time.perf_counter_ns()
         sizes.append(len(zlib.compress(raw, 1)))
         spent_ns.append(time.perf_counter_ns() - began_ns)
     return {
-        "float32_mbit_per_s": round(12 * motion.n_vertices * HZ * 8e-6, 3),
+        "float32_mbit_per_s": round(12 * motion.vertices.shape[1] * HZ * 8e-6, 3),
         "float32_deflate_mbit_per_s": round(float(np.mean(sizes)) * HZ * 8e-6, 3),
         "float32_deflate_encode_ms_p50": compute_percentile(np.array(spent_ns) * 1e-6, 50),
     }
@@ -246,9 +221,7 @@ TIMESTEP_S: Final = 1.0 / (STEPS_PER_FRAME * HZ)
 #: Share of an edge that one hand holds.
 _GRIP: Final = 0.1
 #: Version of the scene and of the file: increment it with either.
-VERSION: Final = 2
-#: Coordinates are kept in 16 bits: 2 m of them in steps of 0.03 mm.
-_LEVELS: Final = 2**16 - 1
+VERSION: Final = 3
 
 _SCENE: Final = """
 <mujoco model="cloth">
@@ -272,75 +245,48 @@ _SCENE: Final = """
 """
 
 
-@dataclass(frozen=True)
-class ClothMotion:
-    """Motion of a cloth at 60 Hz. `nodes` (frames, n, 3): coordinates in units of `scale` [m] from `origin` (3,) [m].
-    `faces` (m, 3): vertex indices."""
+class ClothMotion(NamedTuple):
+    """Motion of a cloth at 60 Hz: `vertices` (frames, n, 3) [m], world frame, and `faces` (m, 3), their indices."""
 
-    nodes: NDArray[np.uint16]
-    origin: NDArray[np.float64]
-    scale: float
+    vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
 
-    @property
-    def n_vertices(self) -> int:
-        """Number of vertices."""
-        return int(self.nodes.shape[1])
-
-    def frame_index(self, frame: int) -> int:
-        """Return the index of the recorded frame for frame number `frame`: the motion runs to its end and back."""
-        period = 2 * (len(self.nodes) - 1)
-        return min(frame % period, period - frame % period)
-
-    def vertices(self, index: int) -> NDArray[np.float64]:
-        """Return the vertices of a recorded frame, (n, 3) [m], world frame."""
-        p_world: NDArray[np.float64] = self.origin + self.nodes[index] * self.scale
-        return p_world
+    def find_frame(self, number: int) -> int:
+        """Return the index of the recorded frame for frame `number`: the motion runs to its end and back."""
+        period = 2 * (len(self.vertices) - 1)
+        return min(number % period, period - number % period)
 
 
-def load_cloth_motion(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
+def load_cloth_motion(side: int, seed: int, progress: Callable[[str], None]) -> ClothMotion:
     """Return the motion of a cloth of `side` x `side` vertices: from the cache, or simulated and stored there."""
-    path = _cache_folder() / f"cloth-v{VERSION}-{side}x{side}-{seed}-mujoco-{version('mujoco')}.npz"
+    path = default_root("bench") / f"cloth-v{VERSION}-{side}x{side}-{seed}-mujoco-{version('mujoco')}.npz"
     try:
         with path.open("rb") as file, np.load(file) as kept:  # numpy leaves a damaged file open
-            return ClothMotion(kept["nodes"], kept["origin"], float(kept["scale"]), kept["faces"])
+            return ClothMotion(kept["vertices"], kept["faces"])
     except FileNotFoundError:
         pass
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         progress(f"{path} cannot be read ({error}): simulating again")
     motion = simulate_cloth(side, seed, progress)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.npz")  # numpy insists on the ending
     try:
-        np.savez(
-            part, allow_pickle=False, nodes=motion.nodes, origin=motion.origin, scale=motion.scale, faces=motion.faces
-        )
-        part.replace(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with Replacement(path) as replacement:
+            np.savez(replacement.file, allow_pickle=False, **motion._asdict())
     except OSError as error:
-        part.unlink(missing_ok=True)
         progress(f"the motion cannot be cached: {error}")
     return motion
 
 
-def simulate_cloth(side: int, seed: int, progress: Callable[[str], None] = lambda _: None) -> ClothMotion:
+def simulate_cloth(side: int, seed: int, progress: Callable[[str], None]) -> ClothMotion:
     """Simulate `SECONDS` of the cloth. The same arguments give the same motion on the same version of MuJoCo."""
     spacing = EDGE_M / (side - 1)
     hands = _Hands(seed)
     left, right = (" ".join(map(str, p)) for p in hands.positions_at(0.0))
     progress(f"simulating a cloth of {side} x {side} vertices once: this takes ten minutes for 100 x 100")
-    model = mujoco.MjModel.from_xml_string(
-        _SCENE.format(
-            grips=_format_grips(side),
-            timestep=TIMESTEP_S,
-            top=TOP_M,
-            left=left,
-            right=right,
-            side=side,
-            spacing=spacing,
-        )
-    )
+    fields = {"timestep": TIMESTEP_S, "top": TOP_M, "left": left, "right": right, "side": side, "spacing": spacing}
+    model = mujoco.MjModel.from_xml_string(_SCENE.format(grips=_format_grips(side), **fields))
     data = mujoco.MjData(model)
-    frames = np.empty((HZ * SECONDS, model.nflexvert, 3))
+    frames = np.empty((HZ * SECONDS, model.nflexvert, 3), np.float32)
     began_s = time.monotonic()
     for frame in range(len(frames)):
         if frame and frame % (HZ // 2) == 0:
@@ -354,10 +300,7 @@ def simulate_cloth(side: int, seed: int, progress: Callable[[str], None] = lambd
         raise BenchError(
             f"the simulated cloth of {side} x {side} vertices (seed {seed}) diverged: choose another --seed"
         )
-    origin = frames.min(axis=(0, 1))
-    scale = float((frames.max(axis=(0, 1)) - origin).max()) / _LEVELS
-    nodes = np.rint((frames - origin) / scale).astype(np.uint16)
-    return ClothMotion(nodes, origin, scale, np.array(model.flex_elem, np.int32).reshape(-1, 3))
+    return ClothMotion(frames, np.array(model.flex_elem, np.int32).reshape(-1, 3))
 
 
 def _format_grips(side: int) -> str:
@@ -387,7 +330,3 @@ class _Hands:
         shake = 0.05 * ramp * (np.sin(2.0 * math.pi * self._hz * t + self._phase) - np.sin(self._phase))
         base = np.array(((-0.5 + reach, -gap, height), (-0.5 + reach, gap, height)))
         return np.asarray(base + shake)
-
-
-def _cache_folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "iris-session" / "bench"

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.authority import AuthorityConfig
+from iris_session.bench.operator import OPENING_STEPS, ScriptedOperator
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.control import ControlConfig
 from iris_session.dataset.cameras import PictureSpec, parse_cameras
@@ -34,10 +35,10 @@ from iris_session.demo.scenes import scene_path
 from iris_session.journal.messages import Batch
 from iris_session.journal.rows import pack_model, seal_keyframe
 from iris_session.physics import find_objects, find_robots, load_model
-from iris_session.protocol.client_messages import Acquire, Episode, Sample
-from iris_session.protocol.common import Pose, Target
-from iris_session.protocol.entries import Entry, Join
-from iris_session.protocol.names import EpisodeAction, Role
+from iris_session.protocol.client_messages import Episode
+from iris_session.protocol.common import Pose
+from iris_session.protocol.entries import Entry
+from iris_session.protocol.names import EpisodeAction
 from iris_session.recording import CLOSED, Keyframe, Recording, SessionHeader, header_root, make_row
 from iris_session.recording.writer import RrdWriter
 from iris_session.replay.simulation import Replay
@@ -61,7 +62,7 @@ FPS: Final = 30
 MAX_RATIO: Final = 1.2
 #: Frames that both writers write.
 REFERENCE_FRAMES: Final = 300
-_AGENT: Final = 1
+_AGENT: Final = ScriptedOperator("desktop", "left")
 
 
 def run_export(
@@ -72,18 +73,7 @@ def run_export(
     python: str = "",
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """Measure the export of one recording.
-
-    Args:
-        episodes: Number of its episodes, at least 3.
-        seconds: Length of each.
-        shadows: Draw pictures in full, which takes much longer without a graphics card.
-        jobs: Processes.
-        python: A Python with LeRobot, for the reference; empty: none.
-        progress: Called with short texts.
-    """
-    if episodes < 3:
-        raise BenchError(f"{episodes} episodes: give 3 or more, of which the first and last are compared")
+    """Measure the export of one recording."""
     with tempfile.TemporaryDirectory(prefix="iris-bench-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         progress(f"computing a session with {episodes} episodes of {seconds:g} s")
@@ -116,17 +106,9 @@ def run_export(
     bars = [make_bar(results, "first_to_last_ratio", "<=", MAX_RATIO)]
     if reference is not None:
         bars.append(make_bar(results, "write_ms_per_frame", "<=", reference["write_ms_per_frame"]))
-    params = {
-        "episodes": episodes,
-        "seconds": seconds,
-        "cameras": N_CAMERAS,
-        "size": f"{WIDTH}x{HEIGHT}",
-        "fps": FPS,
-        "shadows": shadows,
-        "jobs": jobs,
-        "lerobot": python or "none: give a Python with LeRobot, --python, for a reference",
-    }
-    return BenchReport("export", params, results, tuple(bars), reference)
+    params: dict[str, Any] = {"cameras": N_CAMERAS, "size": f"{WIDTH}x{HEIGHT}", "fps": FPS}
+    params["lerobot"] = python or "none: give a Python with LeRobot, --python, for a reference"
+    return BenchReport(results, bars, reference, params)
 
 
 def measure_growth(recording: Path, folder: Path, pictures: PictureSpec) -> tuple[float, float]:
@@ -217,34 +199,14 @@ def _make_keyframe(core: SessionCore, step: int, chain: bytes) -> Keyframe:
 
 def _make_entries(step: int, now_ns: int, ticks: int, period: int) -> Iterator[Entry]:
     """Yield what the agent sends in a step."""
-    if step == 0:
-        join = Join("key", Role.OPERATOR, "agent", devices=("desktop",), alignment="not_needed")
-        yield Entry(_AGENT, _AGENT, now_ns, join)
-    elif step == 1:
-        yield Entry(_AGENT, _AGENT, now_ns, Acquire(1, ("left",)))
+    yield from _AGENT.make_opening(step, now_ns)
     within = (step - PAUSE_TICKS) % period
     if step >= PAUSE_TICKS and within in (0, ticks):
         action = EpisodeAction.SUCCESS if within else EpisodeAction.START
-        yield Entry(_AGENT, _AGENT, now_ns, Episode(100 + step, action, "swing the arm", countdown_ns=0))
-    if step > 2 and step % SAMPLE_TICKS == 0:
-        swing = 0.1 * math.sin(now_ns * 1e-9)
-        yield Entry(
-            _AGENT,
-            _AGENT,
-            now_ns,
-            Sample(
-                device="desktop",
-                kind="pose",
-                seq=step,
-                capture_ns=now_ns,
-                scene_epoch=1,
-                tracking_epoch=0,
-                alignment_version=1,
-                targets=(Target("left", 1),),
-                clutch=step >= PAUSE_TICKS,
-                pose=Pose((0.0, swing, 1.0), (1.0, 0.0, 0.0, 0.0)),
-            ),
-        )
+        yield _AGENT.make_entry(Episode(100 + step, action, "swing the arm", countdown_ns=0), now_ns)
+    if step > OPENING_STEPS and step % SAMPLE_TICKS == 0:
+        pose = Pose((0.0, 0.1 * math.sin(now_ns * 1e-9), 1.0), (1.0, 0.0, 0.0, 0.0))
+        yield _AGENT.make_entry(_AGENT.make_sample(pose, now_ns, step >= PAUSE_TICKS), now_ns)
 
 
 # --- writers alone ----------------------------------------------------------------------------------------------------

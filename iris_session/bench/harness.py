@@ -12,9 +12,9 @@ import os
 import signal
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import accumulate, groupby
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -24,23 +24,26 @@ import psutil
 from numpy.typing import NDArray
 
 from iris_session.authority.config import UNALIGNED, AuthorityConfig
-from iris_session.bench.clients import ClientJob, Job, make_web_secret
+from iris_session.bench.clients import BROWSERS, TABS, ClientJob, Job, make_web_secret
 from iris_session.bench.plugins import PluginProcess
 from iris_session.bench.report import BenchError, compute_percentile
 from iris_session.netsim.process import ImpairmentProcess, make_link_address
 from iris_session.physics import PacerStats
-from iris_session.protocol.client_messages import Sample
+from iris_session.protocol.client_messages import EStop, Sample
 from iris_session.protocol.entries import Entry
 from iris_session.protocol.names import Role
 from iris_session.security import WEB, KeyHome, KeyPair, encode_key
 from iris_session.session.config import SessionConfig
 from iris_session.session.session import Session
+from iris_session.session.status import SessionStatus
 
 Log = dict[str, NDArray[Any]]
 STALL_S: Final = 3.0
 LEAD_S: Final = 0.5  # from the beginning of an interval to the stall
 #: Shortest interval with a stall: the lead, the stall, and a second to recover.
 SHORTEST_STALL_S: Final = LEAD_S + STALL_S + 1.0
+#: Kind of intervals in which nothing is disturbed.
+BASELINE: Final = "baseline"
 #: A frame is fresh if it is at most this much older than the median of the client before the stall.
 FRESH_MS: Final = 20.0
 
@@ -64,23 +67,17 @@ class Interval(NamedTuple):
     def length_s(self) -> float:
         return self.end_s - self.begin_s
 
-    def contains(self, times_ns: NDArray[Any], begin_ns: int) -> NDArray[np.bool_]:
-        """Return which session times lie within, in a window that begins at `begin_ns`."""
-        return select_between(times_ns, begin_ns, self.begin_s, self.end_s)
 
+def plan_rounds(lengths_s: Mapping[str, float], seconds: float, rounds: int, lead_s: float = 0.0) -> list[Interval]:
+    """Return rounds of intervals that fill the seconds after the lead: as many as fit, 1 to `rounds`.
 
-def plan_intervals(kinds: Sequence[str], length_s: float, begin_s: float = 0.0) -> list[Interval]:
-    """Return intervals of one length, one after the other."""
-    return [Interval(kind, begin_s + i * length_s, begin_s + (i + 1) * length_s) for i, kind in enumerate(kinds)]
-
-
-def plan_rounds(
-    kinds: Sequence[str], seconds: float, rounds: int, shortest_s: float, lead_s: float = 0.0
-) -> list[Interval]:
-    """Return rounds of the kinds in turn that fill the seconds after the lead: as many as fit, 1 to `rounds`."""
-    rounds = max(1, min(rounds, int((seconds - lead_s) / (len(kinds) * shortest_s))))
-    length_s = max(shortest_s, (seconds - lead_s) / (len(kinds) * rounds))
-    return plan_intervals(list(kinds) * rounds, length_s, lead_s)
+    `lengths_s`: the shortest length of an interval by its kind.
+    """
+    round_s = sum(lengths_s.values())
+    rounds = max(1, min(rounds, int((seconds - lead_s) / round_s)))
+    stretch = max(1.0, (seconds - lead_s) / (rounds * round_s))
+    times_s = [round(lead_s + stretch * s, 6) for s in accumulate(list(lengths_s.values()) * rounds, initial=0.0)]
+    return [Interval(*one) for one in zip(list(lengths_s) * rounds, times_s[:-1], times_s[1:], strict=True)]
 
 
 def select_between(times_ns: NDArray[Any], begin_ns: int, from_s: float, to_s: float) -> NDArray[np.bool_]:
@@ -88,13 +85,15 @@ def select_between(times_ns: NDArray[Any], begin_ns: int, from_s: float, to_s: f
     return np.asarray((times_ns - begin_ns >= from_s * 1e9) & (times_ns - begin_ns < to_s * 1e9))
 
 
-def compute_age_p99_ms(logs: Iterable[Log], begin_ns: int, from_s: float, to_s: float) -> float:
-    """Return the 99th percentile of the age of state when it was handed to applications between two times of a window
-    [ms], infinite where none was."""
-    ages = [
-        (log["handed_ns"] - log["state_ns"])[select_between(log["handed_ns"], begin_ns, from_s, to_s)] for log in logs
-    ]
-    return compute_percentile(np.concatenate(ages) * 1e-6, 99)
+def compute_ages_ms(logs: Iterable[Log]) -> NDArray[np.float64]:
+    """Return the ages of all states when they were handed to applications [ms]."""
+    return np.concatenate([(log["handed_ns"] - log["state_ns"]) * 1e-6 for log in logs])
+
+
+def compute_age_p99_ms(logs: Sequence[Log], begin_ns: int, from_s: float, to_s: float) -> float:
+    """Return the 99th percentile of the ages between two times of a window [ms], infinite where no state came."""
+    is_between = [select_between(log["handed_ns"], begin_ns, from_s, to_s) for log in logs]
+    return compute_percentile(compute_ages_ms(logs)[np.concatenate(is_between)], 99)
 
 
 def measure_after_stall(log: Log, begin_ns: int, interval: Interval, resumed_ns: int) -> tuple[float, float]:
@@ -141,71 +140,104 @@ EXIT_S: Final = 60.0
 ASK_NS: Final = 50_000_000
 #: Time in which client processes leave the session [s].
 LEAVE_S: Final = 5.0
-#: Plug-ins of clients.
-CLIENTS: Final = "iris_session.bench.clients:StateClients"
-BROWSERS: Final = "iris_session.bench.web_clients:Browsers"
-TABS: Final = "iris_session.bench.web_tab:Tab"
-Group = tuple[ClientJob, ...]  # the clients of one process
 
 
-def group_clients(specs: Sequence[ClientJob]) -> list[Group]:
-    """Group clients into processes of at most `CLIENTS_PER_PROCESS`."""
-    return [tuple(specs[i : i + CLIENTS_PER_PROCESS]) for i in range(0, len(specs), CLIENTS_PER_PROCESS)]
+def _group_clients(clients: Sequence[ClientJob]) -> list[list[ClientJob]]:
+    """Return the clients of each process: at most `CLIENTS_PER_PROCESS` of one plug-in."""
+    groups: list[list[ClientJob]] = []
+    for _, own in groupby(clients, lambda one: (one.plugin, one.alone and one.name)):
+        together = list(own)
+        groups += [together[i : i + CLIENTS_PER_PROCESS] for i in range(0, len(together), CLIENTS_PER_PROCESS)]
+    return groups
 
 
-def assign_links(specs: Sequence[ClientJob], profile: str) -> tuple[list[ClientJob], dict[str, str]]:
-    """Give each client a link of its own. Return the clients, and the profile by link; unchanged without a profile."""
-    if not profile:
-        return list(specs), {}
-    placed = [msgspec.structs.replace(spec, link=make_link_address(i)) for i, spec in enumerate(specs)]
-    return placed, dict.fromkeys((spec.link for spec in placed), profile)
+class Usage(NamedTuple):
+    """Use of the machine by a session in a window.
+
+    `cpu_shares`: of one core, of `server` (authority and front), `recorder` and `gateway`, where they ran at both ends;
+    `rss`: their memory at both ends [bytes]. `late_causes`: late ticks of the last ten seconds by cause.
+    """
+
+    stats: PacerStats
+    late_causes: dict[str, int]
+    cpu_shares: dict[str, float]
+    rss: dict[str, tuple[int, int]]
 
 
-@dataclass
-class Measurement:
+#: Ticks, and by process its processor time [s] and memory [bytes], at one time.
+_Reading = tuple[PacerStats | None, dict[str, tuple[float, int]]]
+
+
+def _read_usage(session: Session, *, anew: bool) -> _Reading:
+    processes = session.processes
+    pids = {
+        "server": (os.getpid(), processes.front_pid),
+        "recorder": (processes.recorder_pid,),
+        "gateway": (0 if processes.web is None else processes.web.pid,),
+    }
+    found = {}
+    for name, own in pids.items():
+        if all(own):
+            times, memory = zip(*((p.cpu_times(), p.memory_info()) for p in map(psutil.Process, own)), strict=True)
+            found[name] = (sum(one.user + one.system for one in times), sum(one.rss for one in memory))
+    return session.lateness(anew=anew), found
+
+
+def _compute_usage(session: Session, begin: _Reading, end: _Reading, seconds: float) -> Usage:
+    before, after, times = begin[0], end[0], session.processes.reporter.times
+    assert before is not None
+    assert after is not None
+    ticks, late = after.ticks - before.ticks, after.late - before.late
+    stats = after._replace(
+        ticks=ticks, finished=after.finished - before.finished, late=late, late_share=late / max(1, ticks)
+    )
+    both = {name: (begin[1][name], end[1][name]) for name in begin[1].keys() & end[1].keys()}
+    return Usage(
+        stats,
+        {} if times is None else times.count_late_causes(),
+        {name: (last[0] - first[0]) / seconds for name, (first, last) in both.items()},
+        {name: (first[1], last[1]) for name, (first, last) in both.items()},
+    )
+
+
+class Measurement(NamedTuple):
     """Measurements of one window.
 
     Attributes:
         seconds: Length of the window.
-        stats: Lateness of its ticks.
-        cpu_share: Processor time of authority and front as a share of one core.
+        begin_ns: Session time of its beginning.
         logs: Logs by client name.
-        scheduling: Priority of the tick loop.
+        usage: What the session used of the machine.
         truth: Poses by tick in the authority.
         received: Sequence number and session time of receipt of samples, by connection and device.
-        rejected: Rejected samples by reason.
+        stops: Session time at which the front received each e-stop, and at which the step that holds had ended.
         connections: Connection numbers by client name.
-        drops: Drops by reason.
-        late_causes: Late ticks of the last ten seconds by cause.
-        begin_ns: Session time of its beginning.
-        recorder_cpu_share: Processor time of the recorder as a share of one core; 0 without a recording.
+        status: Status of the session at the end.
+        rejected: Rejected samples by reason.
     """
 
     seconds: float
-    stats: PacerStats
-    cpu_share: float
+    begin_ns: int
     logs: dict[str, Log]
-    scheduling: str
-    truth: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    received: dict[tuple[int, str], list[tuple[int, int]]] = field(default_factory=dict)
-    rejected: dict[str, int] = field(default_factory=dict)
-    connections: dict[str, int] = field(default_factory=dict)
-    drops: dict[str, int] = field(default_factory=dict)
-    late_causes: dict[str, int] = field(default_factory=dict)
-    begin_ns: int = 0
-    recorder_cpu_share: float = 0.0
+    usage: Usage
+    truth: dict[int, NDArray[np.float64]]
+    received: dict[tuple[int, str], list[tuple[int, int]]]
+    stops: list[tuple[int, int]]
+    connections: dict[str, int]
+    status: SessionStatus
+    rejected: dict[str, int]
 
     def summarize(self, *keys: str) -> dict[str, Any]:
         """Return some of what is measured of the session itself, under the keys of reports."""
         found = {
-            "server_cpu_share": round(self.cpu_share, 3),
-            "late_tick_share": round(self.stats.late_share, 6),
-            "lateness_ms_p99": round(self.stats.p99_ns * 1e-6, 3),
-            "ticks": self.stats.ticks,
+            "server_cpu_share": round(self.usage.cpu_shares["server"], 3),
+            "late_tick_share": round(self.usage.stats.late_share, 6),
+            "lateness_ms_p99": round(self.usage.stats.p99_ns * 1e-6, 3),
+            "ticks": self.usage.stats.ticks,
             "frames_not_logged": sum(int(log["counts"][1]) for log in self.logs.values() if "counts" in log),
-            "late_causes": self.late_causes,
-            "scheduling": self.scheduling,
-            "drops": self.drops,
+            "late_causes": self.usage.late_causes,
+            "scheduling": self.status.scheduling,
+            "drops": self.status.drops,
         }
         return {key: found[key] for key in keys}
 
@@ -213,9 +245,9 @@ class Measurement:
 class ClientProcess(PluginProcess):
     """Process of one group of clients."""
 
-    def __init__(self, plugin: str, job: Job) -> None:
+    def __init__(self, job: Job) -> None:
         self.job = job
-        super().__init__(plugin, job)
+        super().__init__(job.clients[0].plugin, job)
 
     def read_logs(self) -> dict[str, Log]:
         """Return the logs by client name, once the window is over."""
@@ -230,12 +262,18 @@ class ClientProcess(PluginProcess):
 
 @dataclass
 class BenchRun:
-    """Running benchmark, on which an action of `measure` acts. `by_client`: processes by client name."""
+    """Running benchmark, on which an action of `measure` acts. `by_client`: processes by client; `links`: addresses."""
 
     session: Session
     processes: list[ClientProcess]
     by_client: dict[str, ClientProcess]
+    links: dict[str, str]
     proxy: ImpairmentProcess | None
+
+    def command_links(self, command: str) -> None:
+        """Send a command to the process of the links (`netsim.process`)."""
+        assert self.proxy is not None
+        self.proxy.send(command)
 
 
 def make_session_config(
@@ -256,42 +294,47 @@ def make_session_config(
 
 #: Seconds after the beginning of the window, and a function to call then; it must be fast.
 Action = tuple[float, Callable[[BenchRun], None]]
+#: A function that begins a stall (True) or ends it.
+Stall = Callable[[BenchRun, bool], None]
 
 
-def plan_stalls(
-    plan: Sequence[Interval], stalls: Mapping[str, Callable[[BenchRun, bool], None]], resumed: dict[Interval, int]
-) -> list[Action]:
+def plan_stalls(plan: Sequence[Interval], stalls: Mapping[str, Stall], resumed: dict[Interval, int]) -> list[Action]:
     """Return the actions that begin and end the stalls of a plan.
 
     Args:
         plan: Intervals of the window.
-        stalls: By kind of interval, a function that begins a stall (True) or ends it.
+        stalls: By kind of interval.
         resumed: Filled with the session time at which each stall ended [ns].
     """
 
-    def end(run: BenchRun, interval: Interval) -> None:
-        resumed[interval] = run.session.clock()
-        stalls[interval.kind](run, False)
+    def switch(run: BenchRun, interval: Interval, begins: bool) -> None:
+        if not begins:
+            resumed[interval] = run.session.clock()
+        stalls[interval.kind](run, begins)
 
-    actions: list[Action] = []
-    for one in plan:
-        if one.kind in stalls:
-            actions.append((one.stall_s, lambda run, begin=stalls[one.kind]: begin(run, True)))  # type: ignore[misc]
-            actions.append((one.resume_s, functools.partial(end, interval=one)))
-    return actions
+    return [
+        (at_s, functools.partial(switch, interval=one, begins=begins))
+        for one in plan
+        if one.kind in stalls
+        for at_s, begins in ((one.stall_s, True), (one.resume_s, False))
+    ]
 
 
-def stop_client(name: str) -> Callable[[BenchRun, bool], None]:
+def stop_client(name: str) -> Stall:
     """Return a stall of the process of a client, by SIGSTOP."""
     return lambda run, begins: run.by_client[name].send_signal(signal.SIGSTOP if begins else signal.SIGCONT)
 
 
+def stall_link(name: str) -> Stall:
+    """Return a stall of the link of a client, which passes nothing meanwhile."""
+    return lambda run, begins: run.command_links(f"{'stall' if begins else 'resume'} @{run.links[name]}")
+
+
 def measure(
     model: mujoco.MjModel,
-    groups: Mapping[str, Sequence[Group]],
+    clients: Sequence[ClientJob],
     seconds: float,
     *,
-    links: Mapping[str, str] = MappingProxyType({}),
     seed: int = 0,
     actions: Sequence[Action] = (),
     keep_poses: bool = False,
@@ -306,45 +349,38 @@ def measure(
     """Run a session with clients and measure `seconds` of it, warm-up excluded.
 
     Args:
-        model: Model of the session.
-        groups: Clients by process, by plug-in: `CLIENTS`, `BROWSERS` at the session's page without a picture, `TABS`
-            in a real Chromium, or that of a benchmark.
-        seconds: Length of the measured window.
-        links: Link profile by address.
         seed: Random seed of the links.
         actions: Functions to call during the window, in order of their times.
         keep_poses: Keep the true poses of every published tick.
-        curve: Encrypt and authenticate.
         assets: Store of the scene's assets; False: clients get poses only.
         record: File of the recording; False: none.
         stream: Media stream that clients subscribe to.
         topology: File of its topology.
         on_tick: Called after every tick, warm-up included.
-        progress: Called with short texts.
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iris-bench-")))
-        people = [spec.name for group in groups.get(BROWSERS, ()) for spec in group]
-        keys = stack.enter_context(_open_key_home(folder / "keys", people)) if curve else {}
+        people = [spec.name for spec in clients if spec.plugin == BROWSERS]
+        keys = stack.enter_context(_open_key_home(folder / "keys", people)) if curve else ()
         config = make_session_config(assets=assets, record=record, curve=curve)
         session = stack.enter_context(Session(model, config=config))
+        links = {spec.name: make_link_address(i) for i, spec in enumerate(clients) if spec.profile}
         proxy = None
         if links:
-            ports = session.processes.front_ports
-            proxy = stack.enter_context(ImpairmentProcess(links, ports.for_clients, target=ports.host, seed=seed))
-        run = BenchRun(session, [], {}, proxy)
+            ports, profiles = session.processes.front_ports, {links[s.name]: s.profile for s in clients if s.profile}
+            proxy = stack.enter_context(ImpairmentProcess(profiles, ports.for_clients, target=ports.host, seed=seed))
+        run = BenchRun(session, [], {}, links, proxy)
         page = "" if session.processes.web is None else session.processes.web.address
-        if groups.keys() & {BROWSERS, TABS} and not page:
+        if any(spec.plugin in (BROWSERS, TABS) for spec in clients) and not page:
             raise BenchError("the session has no page for browsers")
-        job = Job(session.address, session.origin_ns, "", (), keep_poses, stream, topology, page=page, **keys)
-        for plugin, own in groups.items():
-            for group in own:
-                job = msgspec.structs.replace(job, log=str(folder / f"log{len(run.processes)}.npz"), clients=group)
-                code = _make_code(session) if plugin == TABS else ""
-                worker = ClientProcess(plugin, msgspec.structs.replace(job, page=page + code))
-                stack.callback(worker.close, exit_s=LEAVE_S)
-                run.processes.append(worker)
-                run.by_client.update((spec.name, worker) for spec in group)
+        job = Job(session.address, session.origin_ns, "", (), keep_poses, stream, topology, links=links, keys=keys)
+        for group in _group_clients(clients):
+            log = str(folder / f"log{len(run.processes)}.npz")
+            code = _make_code(session) if group[0].plugin == TABS else ""
+            worker = ClientProcess(msgspec.structs.replace(job, log=log, clients=tuple(group), page=page + code))
+            stack.callback(worker.close, exit_s=LEAVE_S)
+            run.processes.append(worker)
+            run.by_client.update((spec.name, worker) for spec in group)
         return _run_session(run, seconds, actions, on_tick, keep_poses, progress)
 
 
@@ -365,53 +401,59 @@ def _run_session(
     progress(f"warm-up, then measuring {seconds:g} s")
     truth: dict[int, NDArray[np.float64]] = {}
     received: dict[tuple[int, str], list[tuple[int, int]]] = {}
+    stops: list[tuple[int, int]] = []
+    begin = session.clock() + round(WARM_UP_S * 1e9)
+    end = begin + round(seconds * 1e9)
 
     def store_receipts(entries: Sequence[Entry]) -> None:
         for entry in entries:
+            if not begin <= entry.receive_ns < end:
+                continue
             if isinstance(entry.message, Sample):
                 key = (entry.connection, entry.message.device)
                 received.setdefault(key, []).append((entry.message.seq, entry.receive_ns))
+            elif isinstance(entry.message, EStop):
+                stops.append((entry.receive_ns, session.clock()))
 
     if keep_poses:
         session.stepper.on_state = lambda header, poses: truth.update({header.tick: poses.copy()})
     session.stepper.on_entries = store_receipts
-    connections, names = dict(session.stepper.view.connections), session.stepper.view.names_by_id()
-    begin = session.clock() + round(WARM_UP_S * 1e9)
-    end = begin + round(seconds * 1e9)
+    view = session.stepper.view
+    names = view.names_by_id()
+    connections = {names[participant]: number for participant, number in view.connections.items()}
     for worker in workers:
         worker.send("measure", begin, end)
-    meter, pending = _Meter(session, begin, end), list(actions)
+    readings: list[_Reading] = []
+    pending = list(actions)
     if run.proxy is not None:  # the times of link profiles count from the beginning of the window
-        pending.insert(0, (0.0, lambda run: run.proxy.send("start")))  # type: ignore[union-attr]
+        pending.insert(0, (0.0, lambda run: run.command_links("start")))
 
-    def until() -> bool:
+    def is_over() -> bool:
         on_tick(session)
-        while pending and session.clock() >= begin + round(pending[0][0] * 1e9):
+        now = session.clock()
+        while pending and now >= begin + round(pending[0][0] * 1e9):
             pending.pop(0)[1](run)
-        return meter.is_window_over()
+        if now >= (end if readings else begin):
+            readings.append(_read_usage(session, anew=not readings))
+        return len(readings) == 2
 
-    session.run(until=until)
+    session.run(until=is_over)
     _raise_if_stopped(session)
-    stats, cpu_share, recorder_cpu_share = meter.result()
+    if len(readings) < 2:
+        raise BenchError("the session ended before the window was over")
+    usage = _compute_usage(session, readings[0], readings[1], seconds)
     _run_until_answered(session, workers, EXIT_S)
-    received = {key: [s for s in samples if begin <= s[1] < end] for key, samples in received.items()}
-    logs = {name: log for worker in workers for name, log in worker.read_logs().items()}
-    status = session.status()
-    view = session.stepper.view
     return Measurement(
         seconds,
-        stats,
-        cpu_share,
-        logs,
-        status.scheduling,
+        begin,
+        {name: log for worker in workers for name, log in worker.read_logs().items()},
+        usage,
         truth,
         received,
+        stops,
+        connections,
+        session.status(),
         {"/".join(key): count for key, count in view.rejected.items()},
-        {names[p]: c for p, c in connections.items()},
-        status.drops,
-        meter.late_causes,
-        begin,
-        recorder_cpu_share,
     )
 
 
@@ -437,60 +479,23 @@ def _raise_if_stopped(session: Session) -> None:
         raise KeyboardInterrupt
 
 
-class _Meter:
-    """Reads lateness and processor time at both ends of the window, within one run of the session."""
-
-    def __init__(self, session: Session, begin_ns: int, end_ns: int) -> None:
-        self._session, self._begin_ns, self._end_ns = session, begin_ns, end_ns
-        self._processes = [psutil.Process(pid) for pid in (os.getpid(), session.processes.front_pid)]
-        self._readings: list[tuple[PacerStats, float, float]] = []
-        self.late_causes: dict[str, int] = {}
-
-    def is_window_over(self) -> bool:
-        """Return whether the window is over, for `Session.run(until=...)`."""
-        now = self._session.clock()
-        if now >= (self._end_ns if self._readings else self._begin_ns):
-            times = self._session.processes.reporter.times
-            self.late_causes = {} if times is None else times.count_late_causes()
-            stats = self._session.lateness(anew=not self._readings)
-            assert stats is not None
-            recorder = self._session.processes.recorder
-            cpu_s = sum(p.cpu_times().user + p.cpu_times().system for p in self._processes)
-            self._readings.append((stats, cpu_s, 0.0 if recorder is None else recorder.cpu_s))
-        return len(self._readings) == 2
-
-    def result(self) -> tuple[PacerStats, float, float]:
-        """Return the tick statistics of the window, and the CPU of authority and front, and of the recorder, as shares
-        of one core.
-        """
-        if len(self._readings) < 2:
-            raise BenchError("the session ended before the window was over")
-        (before, cpu0, recorder0), (after, cpu1, recorder1) = self._readings
-        window_s = (self._end_ns - self._begin_ns) * 1e-9
-        ticks, late = after.ticks - before.ticks, after.late - before.late
-        stats = after._replace(
-            ticks=ticks, finished=after.finished - before.finished, late=late, late_share=late / max(1, ticks)
-        )
-        return stats, (cpu1 - cpu0) / window_s, (recorder1 - recorder0) / window_s
-
-
 @contextlib.contextmanager
-def _open_key_home(folder: Path, people: Sequence[str]) -> Iterator[dict[str, str]]:
+def _open_key_home(folder: Path, people: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Use a key home in `folder`, which admits one key for all clients, and browsers by their names.
 
     Yields:
         The keys of a job.
     """
     home, pair = KeyHome(folder), KeyPair.generate()
-    server = home.load_server_key()
+    keys = (home.load_server_key().public, pair.public, pair.secret)
     home.clients.allow_key("clients", pair.public)
     for name in people:
-        identity = hashlib.sha256(make_web_secret(pair.secret, name)).digest()
+        identity = hashlib.sha256(make_web_secret(keys, name)).digest()
         home.clients.allow_key(name, encode_key(identity), kind=WEB)
     before = os.environ.get("IRIS_HOME")
     os.environ["IRIS_HOME"] = str(folder)  # of the session and its processes
     try:
-        yield {"server_public": server.public, "public": pair.public, "secret": pair.secret}
+        yield keys
     finally:
         if before is None:
             del os.environ["IRIS_HOME"]

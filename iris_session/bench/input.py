@@ -8,16 +8,13 @@ from typing import Any
 import numpy as np
 
 from iris_session.bench.baseline import measure_baseline
-from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import CLIENTS, Measurement, assign_links, group_clients, measure
-from iris_session.bench.report import BenchReport, compute_percentile, make_bar, make_link_report
+from iris_session.bench.clients import ClientJob, make_operators
+from iris_session.bench.harness import Measurement, measure
+from iris_session.bench.report import BenchReport, make_bar, summarize_percentiles
 from iris_session.bench.state import SESSION_KEYS
 from iris_session.demo.scenes import n_arms_scene
 from iris_session.demo.scenes.generators import arm_names
 from iris_session.protocol.names import Device
-
-STATE_BAR_MS = 3.0
-STATE_PERIOD_MS = 1e3 / 60.0
 
 
 def run_input(
@@ -32,50 +29,32 @@ def run_input(
 ) -> BenchReport:
     """Drive arms with operators while observers watch, at 500 Hz physics.
 
-    Args:
-        operators: Clients that drive one arm each, with 3 devices x 72 Hz.
-        robots: Number of seven-joint arms.
-        observers: Clients that only receive.
-        seconds: Length of the measured window.
-        curve: Encrypt and authenticate.
-        profile: Link profile of every client; results then include the link, and bars do not apply.
-        seed: Random seed.
-        progress: Called with short texts.
-
-    Returns:
-        The report. Reference: `measure_baseline`.
+    Reference: `measure_baseline`.
     """
     model = n_arms_scene(robots).compile()
-    arms = arm_names(robots)
-    specs = [ClientJob(f"operator{i}", "operator", arms[i % robots], samples=True) for i in range(operators)]
-    specs += [ClientJob(f"observer{i}", "observer") for i in range(observers)]
-    specs, links = assign_links(specs, profile)
+    specs = make_operators(arm_names(robots)[:operators], profile)
+    specs += [ClientJob(f"observer{i}", "observer", profile=profile) for i in range(observers)]
     progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(operators + observers)
-    groups = {CLIENTS: group_clients(specs)}
-    got = measure(model, groups, seconds, links=links, seed=seed, curve=curve, progress=progress)
+    got = measure(model, specs, seconds, seed=seed, curve=curve, progress=progress)
     responses = compute_response_ms(got, [spec.name for spec in specs if spec.robot])
     tick_ms = model.opt.timestep * 1e3
     received = sum(map(len, got.received.values()))
     results: dict[str, Any] = {
-        "response_ms_p50": compute_percentile(responses, 50),
-        "response_ms_p99": compute_percentile(responses, 99),
+        **summarize_percentiles("response_ms", responses),
         "samples_followed": len(responses),
         "samples_per_s": round(received / got.seconds, 1),
         "rejected": got.rejected,
         **got.summarize(*SESSION_KEYS),
     }
-    bound = 2.0 * tick_ms + STATE_PERIOD_MS + (6.0 if curve else STATE_BAR_MS)
-    sent = 3 * 72.0 * operators
+    bound = 2.0 * tick_ms + 1e3 / 60.0 + (6.0 if curve else 3.0)  # two ticks, a period of the state, the bar of its age
     bars = [
         make_bar(results, "response_ms_p99", "<=", round(bound, 3)),
         make_bar(results, "late_tick_share", "<", 0.001),
-        make_bar(results, "samples_per_s", ">=", 0.98 * sent),
+        make_bar(results, "samples_per_s", ">=", 0.98 * 3 * 72.0 * operators),
         make_bar(results, "samples_followed", ">=", 0.95 * 72.0 * operators * (seconds - 1.0)),
     ]
-    params = {"operators": operators, "robots": robots, "observers": observers, "seconds": seconds, "curve": curve}
-    params |= {"seed": seed} if profile else {}
-    return make_link_report("input", params, results, bars, profile, reference)
+    return BenchReport(results, bars, reference)
 
 
 def compute_response_ms(got: Measurement, names: list[str]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -9,14 +9,13 @@ from __future__ import annotations
 import gc
 import math
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-import msgspec
 import mujoco
 import numpy as np
 import psutil
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 
 from iris_session.assets.store import AssetStore
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import CLIENTS, Action, BenchRun, Log, compute_age_p99_ms, group_clients, measure
+from iris_session.bench.harness import BenchRun, Log, compute_age_p99_ms, measure
 from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.client import Client
@@ -38,8 +37,6 @@ from iris_session.system.priority import lower_thread_priority
 
 #: Time from the beginning of the window to the join; the baseline of the others is measured first.
 BEGIN_S: Final = 4.0
-#: Largest share of the bytes that a join with a cache may fetch.
-WARM_SHARE: Final = 0.01
 
 
 def run_join(
@@ -52,17 +49,8 @@ def run_join(
 ) -> BenchReport:
     """Join with one client while observers watch.
 
-    Args:
-        objects: Number of moving bodies with meshes.
-        assets_mb: Size of the assets [MB].
-        clients: Number of observers.
-        seconds: Length of the measured window.
-        seed: Random seed.
-        progress: Called with short texts.
-
-    Returns:
-        The report. References, in the same run: the same bytes in one message, and the age of the others' state while
-        memory is copied at the priority at which a client loads assets.
+    References, in the same run: the same bytes in one message, and the age of the others' state while memory is copied
+    at the priority at which a client loads assets.
     """
     progress("compiling the scene")
     model = make_join_model(objects, assets_mb, seed).compile()
@@ -78,8 +66,7 @@ def run_join(
         if ready["built"]:
             raise BenchError(f"{ready['built']} assets were encoded again although the cache is warm")
         paths = [store.path(address) for address in ready["addresses"]]
-        port = stack.enter_context(_serve_in_bulk(paths))
-        joiner = stack.enter_context(PluginProcess("iris_session.bench.join:Joiner", JoinJob(str(folder / "cache"))))
+        joiner = stack.enter_context(PluginProcess("iris_session.bench.join:Joiner", str(folder / "cache")))
         joiner.read()  # it is made
 
         def start_join(run: BenchRun) -> None:
@@ -87,36 +74,18 @@ def run_join(
                 joiner.send("join", run.session.address, run.session.origin_ns)
             joiner.send("copy_memory", run.session.origin_ns)
 
-        actions: list[Action] = [(BEGIN_S, start_join)]
         got = measure(
             model,
-            {CLIENTS: group_clients([ClientJob(f"client{i}", "observer", samples=True) for i in range(clients)])},
+            [ClientJob(f"client{i}", "observer", samples=True) for i in range(clients)],
             seconds,
-            actions=actions,
+            actions=[(BEGIN_S, start_join)],
             assets=store.root,
             seed=seed,
             progress=progress,
         )
         (first, begin_ns, _), (second, _, end_ns), copied = (joiner.read() for _ in range(3))
-        bare_s: float = joiner.ask("transfer_in_bulk", port)
+        bare_s = _transfer_in_bulk(joiner, paths)
     results = {
-        **_summarize(cold, ready, first, second),
-        "others_age_ms_p99": _compute_age_p99_ms(got.logs, begin_ns, end_ns),
-        "others_age_ms_p99_baseline": _compute_age_p99_ms(got.logs, got.begin_ns, begin_ns),
-        **got.summarize("late_tick_share", "scheduling", "drops"),
-    }
-    params = {"objects": objects, "assets_mb": assets_mb, "clients": clients, "seconds": seconds, "seed": seed}
-    reference = {
-        "bare_transfer_s": round(bare_s, 3),
-        "others_age_ms_p99_memory_copied": _compute_age_p99_ms(got.logs, *copied),
-    }
-    return BenchReport("join", params, results, tuple(_make_bars(results, first["bytes"])), reference)
-
-
-def _summarize(
-    cold: dict[str, Any], ready: dict[str, Any], first: dict[str, float], second: dict[str, float]
-) -> dict[str, Any]:
-    return {
         "ready_s": round(ready["seconds"], 3),
         "server_rss_mib": round(ready["rss_mib"], 1),
         "first_picture_s": first["first_picture_s"],
@@ -128,21 +97,26 @@ def _summarize(
         "client_cpu_s": first["client_cpu_s"],
         "ready_cold_s": round(cold["seconds"], 3),
         "server_rss_cold_mib": round(cold["rss_mib"], 1),
+        "others_age_ms_p99": _compute_age_p99_ms(got.logs, begin_ns, end_ns),
+        "others_age_ms_p99_baseline": _compute_age_p99_ms(got.logs, got.begin_ns, begin_ns),
+        **got.summarize("late_tick_share", "scheduling", "drops"),
     }
-
-
-def _make_bars(results: dict[str, Any], sent: float) -> list[Any]:
-    return [
+    reference = {
+        "bare_transfer_s": round(bare_s, 3),
+        "others_age_ms_p99_memory_copied": _compute_age_p99_ms(got.logs, *copied),
+    }
+    bars = (
         make_bar(results, "ready_s", "<=", 2.0),
         make_bar(results, "server_rss_mib", "<=", 150.0),
         make_bar(results, "complete_s", "<=", 1.0),
-        make_bar(results, "warm_bytes", "<=", WARM_SHARE * sent),
+        make_bar(results, "warm_bytes", "<=", 0.01 * first["bytes"]),
         make_bar(results, "others_age_ms_p99", "<=", 3.0),
-    ]
+    )
+    return BenchReport(results, bars, reference)
 
 
 def _prepare_scene(model: Path, store: Path) -> dict[str, Any]:
-    with PluginProcess("iris_session.bench.join:ScenePreparer", SceneJob(str(model), str(store))) as process:
+    with PluginProcess("iris_session.bench.join:ScenePreparer", str(model), str(store)) as process:
         process.read()  # it is made
         prepared: dict[str, Any] = process.ask("prepare")
         return prepared
@@ -150,73 +124,54 @@ def _prepare_scene(model: Path, store: Path) -> dict[str, Any]:
 
 def _compute_age_p99_ms(logs: dict[str, Log], begin_ns: int, end_ns: int) -> float:
     """Return the 99th percentile of the age of state at all clients [ms], of frames between two session times."""
-    p99_ms = compute_age_p99_ms(logs.values(), begin_ns, 0.0, (end_ns - begin_ns) * 1e-9)
+    p99_ms = compute_age_p99_ms(list(logs.values()), begin_ns, 0.0, (end_ns - begin_ns) * 1e-9)
     if not math.isfinite(p99_ms):
         raise BenchError("no client received state while the client joined, or before or after it: increase --seconds")
     return p99_ms
 
 
-@contextmanager
-def _serve_in_bulk(paths: list[Path]) -> Iterator[int]:
-    """Serve all assets in one message, in a thread. Yield the port."""
-    with zmq.Context() as context:
-        socket = context.socket(zmq.REP)
-        port = socket.bind_to_random_port("tcp://127.0.0.1")
-
-        def serve() -> None:
-            with suppress(zmq.ZMQError):  # closed
-                socket.recv()
-                socket.send_multipart([path.read_bytes() for path in paths], copy=False)
-                socket.poll(60_000)  # until it is sent
-
-        thread = threading.Thread(target=serve, name="bench-bare", daemon=True)
-        thread.start()
-        try:
-            yield port
-        finally:
-            context.destroy(linger=0)
-            thread.join()
+def _transfer_in_bulk(joiner: PluginProcess, paths: list[Path]) -> float:
+    """Return the seconds for all assets in one message."""
+    with zmq.Context() as context, context.socket(zmq.REP) as socket:
+        socket.linger = 0
+        joiner.send("transfer_in_bulk", socket.bind_to_random_port("tcp://127.0.0.1"))
+        if not socket.poll(round(JOIN_S * 1e3)):
+            raise BenchError("the process that joins does not ask for the bulk transfer")
+        socket.recv()
+        socket.send_multipart([path.read_bytes() for path in paths], copy=False)
+        bare_s: float = joiner.read()
+        return bare_s
 
 
 # --- the process that joins -------------------------------------------------------------------------------------------
 
 
 JOIN_S: Final = 60.0
-#: Time of copying memory, after a pause in which work of the join ends, with as many threads as a client has for
-#: assets.
-COPY_S: Final = 2.0
-PAUSE_S: Final = 0.5
+#: Threads that copy memory, as many as a client has for assets.
 COPY_THREADS: Final = 2
-COPY_BYTES: Final = 16 << 20
-
-
-class JoinJob(msgspec.Struct, frozen=True):
-    """Job of the process. `cache`: folder of assets, empty at first."""
-
-    cache: str
 
 
 class Joiner(Plugin):
-    """Plug-in that joins. It is started before it is needed: starting Python is not part of joining."""
+    """Plug-in that joins. It is started before it is needed: starting Python is not part of joining.
 
-    job_type = JoinJob
+    Args:
+        cache: Folder of assets, empty at first.
+    """
 
-    def __init__(self, job: JoinJob) -> None:
-        super().__init__(job)
+    def __init__(self, cache: str) -> None:
+        self._cache = cache
         gc.collect()
         gc.freeze()  # Python and its libraries are not part of joining
 
     def join(self, address: str, origin_ns: int) -> tuple[dict[str, float], int, int]:
-        """Join with one client and fetch the whole scene. Raises what the client raises.
+        """Join with one client and fetch the whole scene. Return the results, and session times of begin and end [ns].
 
-        Returns:
-            The results, and the session times of the begin and the end [ns]. Results are times from `connect` on [s]:
-            at `first_picture_s` specification and the coarsest level of every shape are decoded, at `complete_s` all
-            assets are verified by hash and decoded.
+        Results are times from `connect` on [s]: at `first_picture_s` specification and the coarsest level of every
+        shape are decoded, at `complete_s` all assets are verified by hash and decoded.
         """
         begin_ns, cpu_s = time.monotonic_ns(), time.process_time()
         with Client(address, role="observer", name="joiner", alignment="not_needed") as client:
-            client.assets.cache = AssetStore(self.job.cache)
+            client.assets.cache = AssetStore(self._cache)
             scene = client.connection.mirror.scene_hash
             first = client.assets.fetch([scene], decode=lambda _, data: decode_scene(data))
             client.wait_for(lambda _: first.done, JOIN_S)
@@ -245,21 +200,19 @@ class Joiner(Plugin):
 
         This is the cost of any program that leaves no core idle. numpy copies without holding Python's lock.
         """
-        time.sleep(PAUSE_S)
+        time.sleep(0.5)  # work of the join ends
         begin_ns = time.monotonic_ns()
-        end_ns = begin_ns + round(COPY_S * 1e9)
+        end_ns = begin_ns + 2_000_000_000
 
         def copy_until_end() -> None:
             lower_thread_priority()
-            source, target = np.ones(COPY_BYTES, np.uint8), np.zeros(COPY_BYTES, np.uint8)
+            source, target = np.ones(16 << 20, np.uint8), np.zeros(16 << 20, np.uint8)
             while time.monotonic_ns() < end_ns:
                 np.copyto(target, source)
 
-        threads = [threading.Thread(target=copy_until_end) for _ in range(COPY_THREADS)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        with ThreadPoolExecutor(COPY_THREADS) as pool:
+            for _ in range(COPY_THREADS):
+                pool.submit(copy_until_end)
         return begin_ns - origin_ns, end_ns - origin_ns
 
     def transfer_in_bulk(self, port: int) -> float:
@@ -348,19 +301,17 @@ def _make_stone(
         [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1
     )
     at = np.arange(rows * columns).reshape(rows, columns)
-    right = np.roll(at, -1, axis=1)
-    a, b, c, d = at[:-1], at[1:], right[1:], right[:-1]
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    top, bottom = np.full((columns,), at[0, 0]), np.full((columns,), at[-1, 0])
-    caps = [np.stack([top, at[0], right[0]], -1)[1:-1], np.stack([bottom, right[-1], at[-1]], -1)[1:-1]]
-    return points.reshape(-1, 3), np.concatenate([faces, *caps]), np.stack([u, v], axis=-1).reshape(-1, 2)
+    at = np.hstack([at, at[:, :1]])  # closed
+    top, bottom = np.full(columns, at[0, 0]), np.full(columns, at[-1, 0])
+    caps = [np.stack([top, at[0, :-1], at[0, 1:]], -1), np.stack([bottom, at[-1, 1:], at[-1, :-1]], -1)]
+    faces = np.concatenate([split_quads(at), *(cap[1:-1] for cap in caps)])
+    return points.reshape(-1, 3), faces, np.stack([u, v], axis=-1).reshape(-1, 2)
 
 
-class SceneJob(msgspec.Struct, frozen=True):
-    """Files of a compiled model and of the store of its assets."""
-
-    model: str
-    store: str
+def split_quads(grid: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the triangles (n, 3) of a grid of vertices, two for each of its cells."""
+    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+    return np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
 
 
 class ScenePreparer(Plugin):
@@ -369,22 +320,21 @@ class ScenePreparer(Plugin):
     The memory of a scene can only be measured in a process that did nothing else.
     """
 
-    job_type = SceneJob
+    def __init__(self, model: str, store: str) -> None:
+        self._model, self._store = load_model(model), AssetStore(store)
 
     def prepare(self) -> dict[str, Any]:
         """Prepare the scene, and measure it.
 
         Returns:
-            `seconds` from the compiled model to assets that can be fetched, `rss_mib`: peak memory meanwhile, above
-            that of the process with the model, `built`: number of assets that were encoded, `addresses` of all assets.
+            `seconds` from the compiled model to assets that can be fetched; `rss_mib`, peak memory meanwhile above that
+            of the process with the model; `built`, the number of assets that were encoded; `addresses` of all assets.
         """
-        model = load_model(self.job.model)
-        store = AssetStore(Path(self.job.store))
         before = psutil.Process().memory_info().rss
         Path("/proc/self/clear_refs").write_text("5")  # the peak of memory is counted from now on (Linux)
         began_s = time.perf_counter()
-        parsed = parse_mujoco(model, store)
-        scene = store.put(encode_scene(parsed.spec))
+        parsed = parse_mujoco(self._model, self._store)
+        scene = self._store.put(encode_scene(parsed.spec))
         seconds = time.perf_counter() - began_s
         rss_mib = (_read_peak_rss() - before) / 2**20
         addresses = [scene, *list_assets(parsed.spec)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import zlib
-from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from enum import IntEnum, auto
 from pathlib import Path
@@ -45,23 +44,21 @@ def sum_counts(logs: Iterable[Mapping[str, NDArray[Any]]]) -> tuple[dict[str, in
 
 
 class MediaClient(BenchClient):
-    """One client with its log of states and of the frames of one stream."""
+    """One client with its log of states and of the frames of one stream: deformables if there is a topology, clouds if
+    there is none.
+
+    Checksums of deformables are of their vertices, those of clouds of payloads, `UNCHECKED` for most.
+    """
 
     def __init__(self, job: Job, spec: ClientJob) -> None:
         super().__init__(job, spec)
+        self._decoder: DeformableDecoder | None = None
+        if job.topology:
+            self._decoder = DeformableDecoder(DeformableTopology.from_bytes(Path(job.topology).read_bytes()))
         self.feed = self.client.media.subscribe(job.stream)
         self.rows: list[tuple[int, ...]] = []
         self.levels: list[tuple[int, int]] = []  # session time at which a class was received, and the class
-        self.payloads: list[bytes] = []
         self.heads = 0
-
-    @abstractmethod
-    def decode(self, data: bytes) -> Any:
-        """Decode a frame."""
-
-    @abstractmethod
-    def describe(self, data: bytes, decoded: Any) -> tuple[int, int]:
-        """Return the checksum of a frame, and how many points it has. Called after its times are taken."""
 
     def receive(self) -> None:
         """Decode the newest frame, as an application does before it draws."""
@@ -73,7 +70,7 @@ class MediaClient(BenchClient):
             return
         header, data = frame.header, frame.data
         began_ns = time.thread_time_ns()
-        decoded = self.decode(data)
+        points = self._decoder.decode(data) if self._decoder else decode_cloud(data).positions
         spent_ns = time.thread_time_ns() - began_ns
         handed_ns = self._job.session_time_ns()
         if not self.recording:
@@ -83,9 +80,13 @@ class MediaClient(BenchClient):
             return
         topic = len(make_topic(self.client.connection.connection_epoch, self.feed.stream))
         self.heads += topic + len(header.budget_class) + len(encode_media_header(header))
-        checksum, points = self.describe(data, decoded)
+        checksum = UNCHECKED
+        if self._decoder:
+            checksum = zlib.crc32(points.data)
+        elif len(self.rows) % CHECK_EVERY == 0:
+            checksum = zlib.crc32(data)
         level = CLASSES.index(header.budget_class)
-        self.rows.append((header.capture_ns, handed_ns, spent_ns, checksum, len(data), points, level))
+        self.rows.append((header.capture_ns, handed_ns, spent_ns, checksum, len(data), len(points), level))
 
     def to_columns(self) -> dict[str, NDArray[Any]]:
         """Return the log. Columns of `frames`: `MediaColumn`. The last of `counts`: bytes of topics and headers."""
@@ -94,44 +95,11 @@ class MediaClient(BenchClient):
         return super().to_columns() | {
             "frames": np.array(self.rows, np.int64).reshape(-1, len(MediaColumn)),
             "levels": np.array(self.levels, np.int64).reshape(-1, 2),
-            "payloads": np.frombuffer(b"".join(self.payloads), np.uint8),
             "counts": np.array(counts, np.int64),
         }
 
 
-class DeformableClient(MediaClient):
-    """Client of `bench deformable`; keeps the payloads, so that the benchmark can compare them with the truth."""
+class MediaClients(StateClients):
+    """Clients of `bench deformable` and `bench cloud-stream` in one process."""
 
-    def __init__(self, job: Job, spec: ClientJob) -> None:
-        super().__init__(job, spec)
-        self._decoder = DeformableDecoder(DeformableTopology.from_bytes(Path(job.topology).read_bytes()))
-
-    def decode(self, data: bytes) -> Any:
-        return self._decoder.decode(data)
-
-    def describe(self, data: bytes, decoded: Any) -> tuple[int, int]:
-        self.payloads.append(data)
-        return zlib.crc32(decoded.data), len(decoded)
-
-
-class CloudClient(MediaClient):
-    """Client of `bench cloud-stream`. Checksums are those of payloads, `UNCHECKED` for most."""
-
-    def decode(self, data: bytes) -> Any:
-        return decode_cloud(data)
-
-    def describe(self, data: bytes, decoded: Any) -> tuple[int, int]:
-        checksum = UNCHECKED if len(self.rows) % CHECK_EVERY else zlib.crc32(data)
-        return checksum, len(decoded.positions)
-
-
-class DeformableClients(StateClients):
-    """Clients of `bench deformable` in one process."""
-
-    client_type = DeformableClient
-
-
-class CloudClients(StateClients):
-    """Clients of `bench cloud-stream` in one process."""
-
-    client_type = CloudClient
+    client_type = MediaClient

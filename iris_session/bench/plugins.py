@@ -2,8 +2,8 @@
 
     python -m iris_session.bench.plugins iris_session.bench.clients:StateClients
 
-The first line of standard input is the job of the plug-in, every later one a call: `["measure", 1000, 2000]`. Each is
-answered by one line, the job too: what the method returned, as JSON. Between calls the plug-in is polled.
+The first line of standard input has the arguments of the plug-in, every later one is a call: `["measure", 1000, 2000]`.
+Each is answered by one line, the first too: what the method returned, as JSON. Between calls the plug-in is polled.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import json
 import select
 import sys
 import time
-from typing import Any, ClassVar, Final
+from typing import Any, Final, get_type_hints
 
 import msgspec
 
@@ -28,12 +28,7 @@ EXIT_S: Final = 10.0
 
 
 class Plugin:
-    """Base of plug-ins. Public methods are calls; `job_type` is the type of the job that a plug-in is made of."""
-
-    job_type: ClassVar[type[msgspec.Struct]]
-
-    def __init__(self, job: Any) -> None:
-        self.job = job
+    """Base of plug-ins. Public methods are calls. Arguments of the constructor have annotations: they come as JSON."""
 
     def poll(self) -> None:
         """Do what is due between calls; takes `POLL_S` at most."""
@@ -48,15 +43,15 @@ class PluginProcess(ChildProcess):
 
     Args:
         plugin: Module and class of the plug-in, `module:Class`.
-        job: Its job.
+        arguments: Of its constructor.
     """
 
-    def __init__(self, plugin: str, job: msgspec.Struct) -> None:
+    def __init__(self, plugin: str, *arguments: Any) -> None:
         self._name = plugin.partition(":")[2]
         # Ctrl-C ends the benchmark, which ends this.
         super().__init__("iris_session.bench.plugins", [plugin], stdout=PIPE, own_group=True)
         self._answers: list[bytes] = []
-        self.write(msgspec.json.encode(job) + b"\n")
+        self.write(msgspec.json.encode(arguments) + b"\n")
 
     def send(self, method: str, *arguments: Any) -> None:
         """Call a method; `read` returns its answer."""
@@ -90,12 +85,13 @@ class PluginProcess(ChildProcess):
 
 
 def run_plugin(name: str) -> None:
-    """Make a plug-in of the job on standard input, and answer calls until standard input ends."""
+    """Make a plug-in of its arguments on standard input, and answer calls until standard input ends."""
     module, _, kind = name.partition(":")
     plugin_type: type[Plugin] = getattr(importlib.import_module(module), kind)
     # Without a buffer, so that `poll` sees a line that has come.
     with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as calls, open(take_stdout(), "wb", 0) as answers:
-        plugin = plugin_type(msgspec.json.decode(calls.readline(), type=plugin_type.job_type))
+        kinds = get_type_hints(plugin_type.__init__)
+        plugin = plugin_type(*map(msgspec.convert, json.loads(calls.readline()), kinds.values()))
         try:
             answers.write(b"null\n")
             ready = select.poll()

@@ -11,6 +11,7 @@ would be missing if the session had ended with it.
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import select
@@ -19,19 +20,18 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple
 
-import msgspec
 import mujoco
 import numpy as np
 import psutil
 import rerun as rr
 from numpy.typing import NDArray
 
-from iris_session.bench.clients import ClientJob, Job
-from iris_session.bench.harness import CLIENTS, Measurement, group_clients, make_session_config, measure
+from iris_session.bench.clients import CLIENTS, Job, make_operators
+from iris_session.bench.harness import make_session_config, measure
 from iris_session.bench.plugins import Plugin, PluginProcess
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.demo.scenes import free_bodies_scene, scene_path
@@ -45,7 +45,6 @@ from iris_session.demo.scenes.generators import (
     place_arm,
 )
 from iris_session.journal.feed import RATE_NS
-from iris_session.protocol.common import Pose
 from iris_session.recording import NotARecordingError, RecordedState, Recording
 from iris_session.rrd import paths
 from iris_session.rrd.batches import read_index
@@ -58,22 +57,14 @@ from iris_session.viewer.timelines import Moment, to_time_columns
 #: Rounds with a recording, and as many without; and the shortest of them.
 ROUNDS: Final = 3
 SHORTEST_S: Final = 2.0
-MAX_CPU_SHARE: Final = 0.05
-MAX_LOSS_S: Final = 0.25
-MAX_SIZE_RATIO: Final = 1.5
-MAX_REST_MB: Final = 20.0
 #: Time at rest [s]: the rate of a file is measured over `RATE_NS`, after half of it for scene and assets.
 REST_S: Final = 1.5 * RATE_NS * 1e-9 + 5.0
 RECORDER, AUTHORITY, BOTH = "recorder", "authority", "both"
 #: Kills in their order. A session survives that of its recorder, so it has one of the others, too.
 KINDS: Final = (RECORDER, AUTHORITY, RECORDER, BOTH)
-#: From the moment that a recorder is up to date to the kill, drawn at random [s]: at any place between two writes.
-KILL_AFTER_S: Final = (0.5, 1.0)
-POLL_S: Final = 0.02
 START_S: Final = 60.0
 END_S: Final = 30.0
 SESSION: Final = "iris_session.bench.record:RecordedSession"
-_RECORDER: Final = "iris_session.recording.process"
 
 
 class Round(NamedTuple):
@@ -93,10 +84,8 @@ class Kill(NamedTuple):
 
 
 class FileSize(NamedTuple):
-    """Size of a recording and of naive logs of its values [bytes], and their session time [s].
-
-    `naive`: in long batches; `live`: in those of `rerun.log`.
-    """
+    """Size of a recording, and of naive logs of its values in long batches and in those of `rerun.log` [bytes], and
+    their session time [s]."""
 
     recorded: int
     naive: int
@@ -110,60 +99,53 @@ def run_record(
     seed: int = 0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """Measure a session of two operators and 50 bodies with and without a recording, and kill recorded sessions.
-
-    Args:
-        seconds: Measured time of all rounds together.
-        kills: Number of kills.
-        seed: Random seed of motion and kills.
-        progress: Called with short texts.
-    """
+    """Measure a session of two operators and 50 bodies with and without a recording, and kill recorded sessions."""
     rounds = max(1, min(ROUNDS, int(seconds / (2.0 * SHORTEST_S))))
     length_s = max(SHORTEST_S, seconds / (2.0 * rounds))
     with tempfile.TemporaryDirectory(prefix="iris-bench-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         measured: list[Round] = []
-        scheduling, drops = "", dict[str, int]()
+        files: list[Path] = []
+        drops: dict[str, int] = {}
         for i in range(2 * rounds):
             recorded = i % 4 in (0, 3)  # in turn, and neither is always the first
             path = folder / f"round{i}.rrd"
-            kind = "with" if recorded else "without"
-            got = _measure_round(path if recorded else False, length_s, seed, _prefix(progress, i, 2 * rounds, kind))
-            measured.append(Round(recorded, got.stats.late, got.stats.ticks, got.recorder_cpu_share))
-            scheduling = got.scheduling
-            drops |= got.drops if recorded else {}
+            progress(f"round {i + 1} of {2 * rounds}, {'with' if recorded else 'without'} recording")
+            got = measure(
+                make_record_scene(seed).compile(),
+                make_operators(arm_names(OPERATORS)),
+                length_s,
+                record=path if recorded else False,
+                seed=seed,
+                progress=progress,
+            )
+            stats = got.usage.stats
+            measured.append(Round(recorded, stats.late, stats.ticks, got.usage.cpu_shares.get("recorder", 0.0)))
             if recorded:
+                drops |= got.status.drops
+                files.append(path)
                 _wait_for_index(path)
         progress("writing the same values as naive logs")
-        sizes = [measure_size(folder / f"round{i}.rrd", folder) for i in range(2 * rounds) if i % 4 in (0, 3)]
+        sizes = [measure_size(path, folder) for path in files]
         progress("a session at rest")
         rest_mb = measure_rest(folder / "rest.rrd")
         losses, missing = _kill_sessions(folder, kills, seed, progress)
     results = summarize_rounds(measured) | summarize_sizes(sizes) | summarize_kills(losses)
-    results |= {"rest_mb_per_hour": rest_mb, "kill_rows_missing": missing, "scheduling": scheduling, "drops": drops}
+    results |= {
+        "rest_mb_per_hour": rest_mb,
+        "kill_rows_missing": missing,
+        "scheduling": got.status.scheduling,
+        "drops": drops,
+    }
     params = {"operators": OPERATORS, "bodies": BODIES, "seconds": 2 * rounds * length_s, "rounds": rounds}
-    return BenchReport("record", params | {"kills": kills, "seed": seed}, results, tuple(make_record_bars(results)))
-
-
-def _prefix(progress: Callable[[str], None], i: int, n: int, kind: str) -> Callable[[str], None]:
-    return lambda text: progress(f"round {i + 1} of {n}, {kind} recording: {text}")
-
-
-def _make_operators() -> list[ClientJob]:
-    return [ClientJob(f"operator{i}", "operator", arm, samples=True) for i, arm in enumerate(arm_names(OPERATORS))]
-
-
-def _measure_round(record: Path | bool, seconds: float, seed: int, progress: Callable[[str], None]) -> Measurement:
-    model = make_record_scene(seed).compile()
-    groups = {CLIENTS: group_clients(_make_operators())}
-    return measure(model, groups, seconds, record=record, seed=seed, progress=progress)
+    return BenchReport(results, make_record_bars(results), params=params)
 
 
 def _wait_for_index(path: Path) -> None:
     """Wait until a finished recording has its index: the next round is measured without the process that adds it."""
     until = time.monotonic() + END_S
     while time.monotonic() < until and not scan_file(path).indexed:
-        time.sleep(POLL_S)
+        time.sleep(0.02)
 
 
 # --- results ----------------------------------------------------------------------------------------------------------
@@ -225,25 +207,25 @@ def summarize_sizes(sizes: Sequence[FileSize]) -> dict[str, Any]:
 def summarize_kills(kills: Sequence[Kill]) -> dict[str, Any]:
     """Return what kills take from the files, of all and by kind."""
     losses = [kill.loss_s for kill in kills]
-    results: dict[str, Any] = {
-        "kills": {kind: sum(k.kind == kind for k in kills) for kind in (RECORDER, AUTHORITY, BOTH)}
+    by_kind = {kind: [k.loss_s for k in kills if k.kind == kind] for kind in (RECORDER, AUTHORITY, BOTH)}
+    return {
+        "kills": {kind: len(of) for kind, of in by_kind.items()},
+        "kill_loss_s_p50": round(float(np.percentile(losses, 50)), 4),
+        "kill_loss_s_p95": round(float(np.percentile(losses, 95)), 4),
+        "kill_loss_s_max": round(max(losses), 4),
+        "kill_loss_s_max_by_kind": {kind: round(max(of), 4) for kind, of in by_kind.items() if of},
     }
-    for label, percentile in (("p50", 50), ("p95", 95), ("max", 100)):
-        results[f"kill_loss_s_{label}"] = round(float(np.percentile(losses, percentile)), 4)
-    largest = {kind: [k.loss_s for k in kills if k.kind == kind] for kind in (RECORDER, AUTHORITY, BOTH)}
-    results["kill_loss_s_max_by_kind"] = {kind: round(max(of), 4) for kind, of in largest.items() if of}
-    return results
 
 
 def make_record_bars(results: dict[str, Any]) -> list[Any]:
     """Return the bars. Those with a recording are compared with those without it, and their spread."""
     late = round(results["late_tick_share_off"] + results["late_tick_share_off_spread"], 6)
     return [
-        make_bar(results, "writer_cpu_share", "<=", MAX_CPU_SHARE),
+        make_bar(results, "writer_cpu_share", "<=", 0.05),
         make_bar(results, "late_tick_share_on", "<=", late),
-        make_bar(results, "size_ratio", "<=", MAX_SIZE_RATIO),
-        make_bar(results, "rest_mb_per_hour", "<=", MAX_REST_MB),
-        make_bar(results, "kill_loss_s_max", "<=", MAX_LOSS_S),
+        make_bar(results, "size_ratio", "<=", 1.5),
+        make_bar(results, "rest_mb_per_hour", "<=", 20.0),
+        make_bar(results, "kill_loss_s_max", "<=", 0.25),
         make_bar(results, "kill_rows_missing", "<=", 0),
     ]
 
@@ -265,23 +247,16 @@ def _kill_sessions(folder: Path, kills: int, seed: int, progress: Callable[[str]
         pair = kinds[i : i + 2]
         progress(f"kill {i + 1} of {kills}: {', then '.join(pair)}")
         path = folder / f"killed{i}" / paths.FIRST_FILE
-        with KilledSession(path, seed) as session:
-            killed = [(kind, session.kill(kind, random_of.uniform(*KILL_AFTER_S))) for kind in pair]
-        lost, gaps = read_losses(path, killed)
+        lost, gaps = read_losses(path, kill_session(path, seed, pair, random_of))
         losses += lost
         missing += gaps
     return losses, missing
 
 
 def read_losses(path: Path, kills: Sequence[tuple[str, int]]) -> tuple[list[Kill], int]:
-    """Read what kills have left of a recording.
+    """Return the losses of kills of a recording, and how many rows are missing between others in what is left.
 
-    Args:
-        path: Its first file.
-        kills: What was killed, and the session time of the kill [ns], in order.
-
-    Returns:
-        The kills with their losses, and the number of rows that are missing between others.
+    `kills`: what was killed, and the session time of the kill [ns], in order.
     """
     losses = []
     for part, (kind, at_ns) in enumerate(kills, 1):
@@ -298,72 +273,36 @@ def read_losses(path: Path, kills: Sequence[tuple[str, int]]) -> tuple[list[Kill
     return losses, gaps
 
 
-class KilledSession:
-    """A session with its operators in other processes, all of which end with this context.
+def kill_session(path: Path, seed: int, kinds: Sequence[str], random_of: random.Random) -> list[tuple[str, int]]:
+    """Record a session, and kill processes of it, as `kinds` says, each time after the recorder has caught up.
 
-    Args:
-        path: First file of its recording.
-        seed: Random seed of the motion.
+    Returns:
+        What was killed, and the session time of the kill [ns].
     """
-
-    def __init__(self, path: Path, seed: int) -> None:
-        self._started: list[psutil.Process] = []
-        with ExitStack() as stack:
-            self._session = PluginProcess(SESSION, SessionJob(str(path), seed))
-            stack.callback(self._end)
-            self._session.read(START_S)
-            self._origin_ns: int
-            address, self._origin_ns = self._session.ask("describe", timeout_s=START_S)
-            job = Job(address, self._origin_ns, "", tuple(_make_operators()))
-            stack.enter_context(PluginProcess(CLIENTS, job)).read(START_S)
-            self._stack = stack.pop_all()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-    def kill(self, kind: str, after_s: float) -> int:
-        """Kill processes some time after the recorder has caught up.
-
-        Args:
-            kind: `RECORDER`, `AUTHORITY` or `BOTH`.
-            after_s: Seconds to wait.
-
-        Returns:
-            The session time of the kill [ns].
-        """
-        if not self._session.ask("wait_until_written", START_S):
-            raise BenchError("the recorder of a session that is to be killed is not up to date")
-        self._started = psutil.Process(self._session.pid).children(recursive=True)
-        time.sleep(after_s)
-        recorder = self._find_recorder()
-        victims = {RECORDER: [recorder], AUTHORITY: [self._session.pid], BOTH: [recorder, self._session.pid]}[kind]
-        if 0 in victims:
-            raise BenchError("the recorder ended before it was killed")
-        now_ns = time.monotonic_ns()
-        for pid in victims:
-            os.kill(pid, signal.SIGKILL)
-        return now_ns - self._origin_ns
-
-    def _find_recorder(self) -> int:
-        """Return the process id of the recorder, 0 if there is none."""
-        for process in self._started:
-            with suppress(psutil.Error):
-                if _RECORDER in process.cmdline():
-                    return int(process.pid)
-        return 0
-
-    def _end(self) -> None:
-        """End the session, and wait for its processes: a recorder whose session was killed writes the rest first."""
+    killed: list[tuple[str, int]] = []
+    children: list[psutil.Process] = []
+    session = PluginProcess(SESSION, str(path), seed)
+    try:
+        session.read(START_S)
+        for kind in kinds:
+            recorder, origin_ns = session.ask("wait_until_written", START_S)
+            if not recorder:
+                raise BenchError("the recorder of a session that is to be killed is not up to date")
+            children = psutil.Process(session.pid).children(recursive=True)
+            time.sleep(random_of.uniform(0.5, 1.0))  # until any moment between two writes
+            now_ns = time.monotonic_ns()
+            for pid in {RECORDER: [recorder], AUTHORITY: [session.pid], BOTH: [recorder, session.pid]}[kind]:
+                os.kill(pid, signal.SIGKILL)
+            killed.append((kind, now_ns - origin_ns))
+    finally:
         with suppress(psutil.Error):
-            self._started = psutil.Process(self._session.pid).children(recursive=True) or self._started
-        self._session.close(exit_s=END_S)
-        _, alive = psutil.wait_procs(self._started, timeout=END_S)
-        for process in alive:
+            children = psutil.Process(session.pid).children(recursive=True) or children
+        session.close(exit_s=END_S)
+        # A recorder whose session was killed writes the rest first.
+        for process in psutil.wait_procs(children, timeout=END_S)[1]:
             with suppress(psutil.Error):
                 process.kill()
+    return killed
 
 
 # --- naive logs of the same values ------------------------------------------------------------------------------------
@@ -375,7 +314,7 @@ LONG_BATCH_S: Final = 8.0
 LOG_BATCH_S: Final = 0.2
 _SCALARS: Final = "Scalars:scalars"
 _TIMELINES: Final = (paths.STEP, paths.SIM_TIME, paths.SESSION_TIME, paths.WALL_TIME)
-_Rows = dict[str, list[tuple[Moment, list[float]]]]
+_Row = tuple[str, Moment, list[float]]  # entity, time, values
 
 
 def write_naive_log(recording: Recording, output: Path, batch_s: float) -> int:
@@ -388,22 +327,13 @@ def write_naive_log(recording: Recording, output: Path, batch_s: float) -> int:
     log = rr.RecordingStream("naive", recording_id="naive")
     log.set_log_time_enabled(False)
     log.save(output)
-    states = list(recording.states())
+    states, header = list(recording.states()), recording.header
     if states:
-        header, first = recording.header, _make_moment(states[0], recording.header.origin_utc_ns)
         picture = SceneLayer(log)
         picture.set_scene(SceneSource(header.model, header.bodies, robots=header.robots))
-        picture.draw(first)
-    for rows in _split(_list_poses(states, recording.header.origin_utc_ns), batch_s):
-        for entity, taken in rows.items():
-            poses = np.array([pose for _, pose in taken], np.float32)
-            columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, [4, 5, 6, 3]])
-            _send(log, entity, [moment for moment, _ in taken], columns)
-    for rows in _split(sorted(_list_scalars(recording), key=lambda row: row[1].session_ns), batch_s):
-        for entity, taken in rows.items():
-            values = np.array([row for _, row in taken], np.float64)
-            columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
-            _send(log, entity, [moment for moment, _ in taken], columns)
+        picture.draw(_make_moment(states[0], header.origin_utc_ns))
+    _send(log, _list_poses(states, header.origin_utc_ns), batch_s, _make_transforms)
+    _send(log, _list_scalars(recording), batch_s, _make_scalars)
     for event in recording.events():
         log.set_time(paths.SESSION_TIME, duration=np.timedelta64(event.session_time, "ns"))
         log.log("events", rr.TextLog(repr(event.body)))
@@ -411,19 +341,19 @@ def write_naive_log(recording: Recording, output: Path, batch_s: float) -> int:
     return output.stat().st_size
 
 
-def _list_poses(states: list[RecordedState], origin_utc_ns: int) -> Iterator[tuple[str, Moment, list[float]]]:
-    """Yield entity, time and pose (`x y z qw qx qy qz`) of every moving body and device at every state."""
+def _list_poses(states: list[RecordedState], origin_utc_ns: int) -> Iterator[_Row]:
+    """Yield the pose (`x y z qw qx qy qz`) of every moving body and device at every state."""
     for state in states:
         moment = _make_moment(state, origin_utc_ns)
         for body, pose in zip(state.bodies, state.poses.tolist(), strict=True):
             if body.moving:
                 yield f"bodies/{escape_entity_part(body.name)}", moment, pose
         for item in state.presence:
-            yield f"people/{item.participant}/{item.device}", moment, _list_numbers(item.pose)
+            yield f"people/{item.participant}/{item.device}", moment, [*item.pose.p, *item.pose.q]
 
 
-def _list_scalars(recording: Recording) -> Iterator[tuple[str, Moment, list[float]]]:
-    """Yield entity, time and values of what the recording plots: joints, grippers, speeds, delays."""
+def _list_scalars(recording: Recording) -> Iterator[_Row]:
+    """Yield the values of what the recording plots: joints, grippers, speeds, delays."""
     for file in recording.readable_files:
         for chunk in read_chunks(file, (f"{paths.ROBOTS}/**", f"{paths.METRICS}/**")):
             batch = chunk.to_record_batch()
@@ -434,32 +364,33 @@ def _list_scalars(recording: Recording) -> Iterator[tuple[str, Moment, list[floa
                 yield str(chunk.entity_path), Moment(*moment), values
 
 
-def _split(rows: Iterable[tuple[str, Moment, list[float]]], batch_s: float) -> Iterator[_Rows]:
-    """Collect rows in order of time by entity, in batches."""
-    begin_ns: int | None = None
-    batch: _Rows = {}
-    for entity, moment, values in rows:
-        if begin_ns is None or not 0 <= moment.session_ns - begin_ns < batch_s * 1e9:
-            if batch:
-                yield batch
-            begin_ns, batch = moment.session_ns, {}
-        batch.setdefault(entity, []).append((moment, values))
-    if batch:
-        yield batch
-
-
 def _make_moment(state: RecordedState, origin_utc_ns: int) -> Moment:
     time_ns = state.session_time
     return Moment(state.step, round(state.sim_time * 1e9), time_ns, time_ns + origin_utc_ns)
 
 
-def _list_numbers(pose: Pose) -> list[float]:
-    return [*pose.p, *pose.q]
+def _make_transforms(poses: NDArray[np.float64]) -> Any:
+    numbers = poses.astype(np.float32)
+    return rr.Transform3D.columns(translation=numbers[:, :3], quaternion=numbers[:, [4, 5, 6, 3]])
 
 
-def _send(log: rr.RecordingStream, entity: str, moments: list[Moment], columns: Any) -> None:
-    times: NDArray[np.int64] = np.array(moments, np.int64).T
-    rr.send_columns(entity, to_time_columns(times), [*columns], recording=log, strict=True)
+def _make_scalars(values: NDArray[np.float64]) -> Any:
+    return rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
+
+
+def _send(
+    log: rr.RecordingStream, rows: Iterable[_Row], batch_s: float, make_columns: Callable[[NDArray[np.float64]], Any]
+) -> None:
+    """Send the rows of every entity in batches."""
+
+    def find_batch(row: _Row) -> tuple[str, int]:
+        return row[0], row[1].session_ns // round(batch_s * 1e9)
+
+    for (entity, _), batch in itertools.groupby(sorted(rows, key=find_batch), find_batch):
+        _, moments, values = zip(*batch, strict=True)
+        times: NDArray[np.int64] = np.array(moments, np.int64).T
+        columns = make_columns(np.array(values, np.float64))
+        rr.send_columns(entity, to_time_columns(times), [*columns], recording=log, strict=True)
 
 
 # --- the session that is killed ---------------------------------------------------------------------------------------
@@ -468,22 +399,13 @@ def _send(log: rr.RecordingStream, entity: str, moments: list[Moment], columns: 
 #: Moving bodies: those that fly, and ten of each of the two arms.
 BODIES: Final = 50
 OPERATORS: Final = 2
-POLL_NS: Final = 20_000_000
 #: Age of the newest row at its write [ns] from which on a recorder has caught up.
 CURRENT_NS: Final = 250_000_000
-_FREE: Final = BODIES - 10 * OPERATORS
-
-
-class SessionJob(msgspec.Struct, frozen=True):
-    """Job of the process. `path`: first file of the recording."""
-
-    path: str
-    seed: int
 
 
 def make_record_scene(seed: int) -> Any:
     """Return an `mujoco.MjSpec` with two arms and as many flying bodies as make `BODIES` that move."""
-    spec = free_bodies_scene(_FREE, seed)
+    spec = free_bodies_scene(BODIES - 10 * OPERATORS, seed)
     home = spec.key("home")
     qpos, qvel = list(home.qpos), list(home.qvel)
     spec.delete(home)
@@ -498,15 +420,16 @@ def make_record_scene(seed: int) -> Any:
 
 
 class RecordedSession(Plugin):
-    """Plug-in that runs a recorded session of the scene."""
+    """Plug-in that runs a recorded session of the scene with its operators. `path`: first file of the recording."""
 
-    job_type = SessionJob
-
-    def __init__(self, job: SessionJob) -> None:
-        super().__init__(job)
-        model = make_record_scene(job.seed).compile()
-        self._session = Session(model, config=make_session_config(record=Path(job.path)))
+    def __init__(self, path: str, seed: int) -> None:
+        model = make_record_scene(seed).compile()
+        self._session = Session(model, config=make_session_config(record=Path(path)))
         self._session.start()
+        job = Job(self._session.address, self._session.origin_ns, "", tuple(make_operators(arm_names(OPERATORS))))
+        self._operators = PluginProcess(CLIENTS, job)
+        self._session.run(seconds=START_S, until=self._operators.has_answered)
+        self._operators.read()
         self._known = 0
         self._calls = select.poll()
         self._calls.register(sys.stdin.fileno(), select.POLLIN)
@@ -515,12 +438,12 @@ class RecordedSession(Plugin):
         """Run the session until the next call: every begin of a run costs it a moment."""
         self._session.run(until=lambda: self._calls.poll(0))
 
-    def describe(self) -> tuple[str, int]:
-        """Return the address of the session, and its origin: session time zero on CLOCK_MONOTONIC [ns]."""
-        return self._session.address, self._session.origin_ns
+    def wait_until_written(self, timeout_s: float) -> tuple[int, int]:
+        """Run until a recorder that is new has written the rows that waited for it.
 
-    def wait_until_written(self, timeout_s: float) -> bool:
-        """Run until a recorder that is new has written the rows that waited for it; return whether it has."""
+        Returns:
+            Its process id, 0 if there is none; and session time zero on CLOCK_MONOTONIC [ns].
+        """
         due_ns = 0
 
         def is_written() -> bool:
@@ -528,7 +451,7 @@ class RecordedSession(Plugin):
             feed, now_ns = self._session.processes.feed, self._session.clock()
             if now_ns < due_ns or feed is None:
                 return False
-            due_ns = now_ns + POLL_NS
+            due_ns = now_ns + 20_000_000
             last = feed.stats.recorder
             if last is None or last.instance == self._known or last.written < 0 or not 0 < last.lag_ns < CURRENT_NS:
                 return False
@@ -537,8 +460,9 @@ class RecordedSession(Plugin):
 
         before = self._known
         self._session.run(seconds=timeout_s, until=is_written)
-        return self._known != before
+        return self._session.processes.recorder_pid if self._known != before else 0, self._session.origin_ns
 
     def close(self) -> None:
         """Close the session."""
+        self._operators.close()
         self._session.close()

@@ -59,15 +59,16 @@ def make_bar(results: dict[str, Any], key: str, op: str, bound: float) -> Bar:
 class BenchReport(msgspec.Struct, frozen=True):
     """Report that `iris-session bench NAME --json` prints.
 
+    A benchmark gives results, bars, reference, and the parameters that are no options; `complete` adds the rest.
     `stolen_share`: share of processor time that other virtual machines used meanwhile, 0 where that is not known.
     `parallel_speed`: see `measure_parallel_speed`, the lower of the values before and after.
     """
 
-    name: str
-    params: dict[str, Any]
     results: dict[str, Any]
-    bars: tuple[Bar, ...]
+    bars: Sequence[Bar]
     reference: dict[str, float] | None = None
+    params: dict[str, Any] = {}
+    name: str = ""
     version: int = VERSION
     stolen_share: float = 0.0
     parallel_speed: float = 1.0
@@ -76,6 +77,16 @@ class BenchReport(msgspec.Struct, frozen=True):
     def ok(self) -> bool:
         """True if no bar is missed."""
         return all(b.ok for b in self.bars)
+
+    def complete(self, name: str, options: dict[str, Any], stolen_share: float, parallel_speed: float) -> BenchReport:
+        """Return the report of a run with these options. With a link profile, no bar applies."""
+        params = {key: value for key, value in options.items() if value != ""} | self.params
+        bars = self.bars
+        if options.get("profile"):
+            params, bars = params | {"bars": NO_BARS}, ()
+        return BenchReport(
+            self.results, bars, self.reference, params, name, stolen_share=stolen_share, parallel_speed=parallel_speed
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the JSON object. Infinite values (an age of something that never arrived) are null."""
@@ -108,20 +119,6 @@ class BenchReport(msgspec.Struct, frozen=True):
         if self.parallel_speed < MAX_PARALLEL_SPEED:
             rows.append(f"with all processors in use, a thread is {self.parallel_speed:.2f} times as fast as alone")
         return "\n".join(rows)
-
-
-def make_link_report(
-    name: str,
-    params: dict[str, Any],
-    results: dict[str, Any],
-    bars: Sequence[Bar],
-    profile: str,
-    reference: dict[str, float] | None = None,
-) -> BenchReport:
-    """Return the report of a benchmark whose clients may have links; with a link profile its bars do not apply."""
-    if not profile:
-        return BenchReport(name, params, results, tuple(bars), reference)
-    return BenchReport(name, params | {"profile": profile, "bars": NO_BARS}, results, (), reference)
 
 
 def read_stolen_time() -> tuple[float, float]:
@@ -167,6 +164,16 @@ def flatten(results: dict[str, Any]) -> dict[str, Any]:
 def compute_percentile(values: NDArray[Any], q: float) -> float:
     """Return a percentile of values, to three decimals; infinite, so null in a report, where there are none."""
     return round(float(np.percentile(values, q)), 3) if len(values) else math.inf
+
+
+def summarize_percentiles(key: str, values: NDArray[Any], percentiles: Sequence[int] = (50, 99)) -> dict[str, float]:
+    """Return percentiles of values under the keys `KEY_p50`, `KEY_p99`."""
+    return {f"{key}_p{q}": compute_percentile(values, q) for q in percentiles}
+
+
+def allow_increase(age_ms: float) -> float:
+    """Return the bar of a disturbed age of state: a fifth more than without the disturbance, or 1 ms more."""
+    return round(age_ms + max(0.2 * age_ms, 1.0), 3)
 
 
 def _replace_infinite(value: Any) -> Any:

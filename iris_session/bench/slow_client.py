@@ -9,32 +9,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-import msgspec
-
 from iris_session.bench.clients import ClientJob
 from iris_session.bench.harness import (
-    CLIENTS,
+    BASELINE,
     CLIENTS_PER_PROCESS,
     SHORTEST_STALL_S,
     STALL_S,
-    BenchRun,
     Interval,
-    assign_links,
     compute_age_p99_ms,
-    group_clients,
     measure,
     plan_rounds,
     plan_stalls,
+    stall_link,
     stop_client,
     summarize_runs,
     summarize_stalls,
 )
-from iris_session.bench.report import BenchReport, make_bar, make_link_report
+from iris_session.bench.report import BenchReport, allow_increase, make_bar
 from iris_session.demo.scenes import free_bodies_scene
-from iris_session.netsim.process import make_link_address
 
 ROUNDS: Final = 3
-STOPPED, STALLED, BASELINE = "stopped", "stalled", "baseline"
+STOPPED, STALLED = "stopped", "stalled"
 #: IRIS SimPublisher 2.2 on a machine of this kind, plain: DESIGN of the project, measured.
 REFERENCE: Final = {"resume_first_age_ms": 2980.0, "resume_fresh_after_ms": 4400.0}
 
@@ -48,58 +43,35 @@ def run_slow_client(
     profile: str = "",
     progress: Callable[[str], None] = lambda _: None,
 ) -> BenchReport:
-    """Stall two of the clients in turn.
-
-    Args:
-        clients: Number of observers, two of which stall.
-        bodies: Number of moving bodies.
-        seconds: Length of the measured window.
-        seed: Random seed.
-        curve: Encrypt and authenticate.
-        profile: Link profile of every client; bars do not apply then. Without it only the stalled client has a link,
-            which forwards without delay.
-        progress: Called with short texts.
-    """
+    """Stall two of the clients in turn."""
     model = free_bodies_scene(bodies, seed).compile()
-    specs = [ClientJob(f"client{i}", "observer", samples=i < CLIENTS_PER_PROCESS) for i in range(clients - 2)]
-    names = [spec.name for spec in specs]
-    specs, links = assign_links([*specs, ClientJob(STOPPED, "observer"), ClientJob(STALLED, "observer")], profile)
-    stalled = make_link_address(clients - 1)
-    specs[-1] = msgspec.structs.replace(specs[-1], link=stalled)
-    links[stalled] = profile or "none"
-    groups = {CLIENTS: [*group_clients(specs[:-2]), *((spec,) for spec in specs[-2:])]}
-    plan = plan_rounds((BASELINE, STOPPED, STALLED), seconds, ROUNDS, SHORTEST_STALL_S)
+    specs = [
+        ClientJob(f"client{i}", "observer", samples=i < CLIENTS_PER_PROCESS, profile=profile)
+        for i in range(clients - 2)
+    ]
+    stopped = ClientJob(STOPPED, "observer", profile=profile, alone=True)
+    stalled = ClientJob(STALLED, "observer", profile=profile or "none", alone=True)
+    plan = plan_rounds(dict.fromkeys((BASELINE, STOPPED, STALLED), SHORTEST_STALL_S), seconds, ROUNDS)
     total_s = plan[-1].end_s
     resumed: dict[Interval, int] = {}  # session time [ns] at which the stall ended
-    actions = plan_stalls(plan, {STOPPED: stop_client(STOPPED), STALLED: _stall_link(stalled)}, resumed)
-    got = measure(model, groups, total_s, links=links, seed=seed, actions=actions, curve=curve, progress=progress)
+    actions = plan_stalls(plan, {STOPPED: stop_client(STOPPED), STALLED: stall_link(STALLED)}, resumed)
+    every = [*specs, stopped, stalled]
+    got = measure(model, every, total_s, seed=seed, actions=actions, curve=curve, progress=progress)
     results: dict[str, Any] = {}
     for kind, prefix in ((STOPPED, ""), (STALLED, "link_")):
         results |= summarize_stalls(got.logs[kind], got.begin_ns, resumed, kind, prefix)
-    others = [got.logs[name] for name in names]
+    others = [got.logs[spec.name] for spec in specs]
     for kind, key in ((STOPPED, ""), (STALLED, "_link"), (BASELINE, "_baseline")):
         stretches = [one for one in plan if one.kind == kind]
         p99s = [compute_age_p99_ms(others, got.begin_ns, one.stall_s, one.end_s) for one in stretches]
         results |= summarize_runs(f"others_age_ms_p99{key}", p99s)
     results |= got.summarize("late_tick_share", "scheduling", "drops")
-    params: dict[str, Any] = {"clients": clients, "bodies": bodies, "seconds": total_s, "stall_s": STALL_S}
-    params |= {"rounds": len(plan) // 3, "seed": seed, "curve": curve}
-    return make_link_report("slow-client", params, results, _make_bars(results), profile, REFERENCE)
-
-
-def _stall_link(link: str) -> Callable[[BenchRun, bool], None]:
-    """Return a stall of a link, which passes nothing meanwhile."""
-
-    def stall(run: BenchRun, begins: bool) -> None:
-        assert run.proxy is not None
-        run.proxy.send(f"{'stall' if begins else 'resume'} @{link}")
-
-    return stall
+    params = {"seconds": total_s, "stall_s": STALL_S, "rounds": len(plan) // 3}
+    return BenchReport(results, _make_bars(results), REFERENCE, params)
 
 
 def _make_bars(results: dict[str, Any]) -> list[Any]:
-    baseline = results["others_age_ms_p99_baseline"]
-    bound = round(baseline + max(0.2 * baseline, 1.0), 3)
+    bound = allow_increase(results["others_age_ms_p99_baseline"])
     keys = ("resume_first_age_ms", "resume_fresh_after_ms", "link_resume_first_age_ms", "link_resume_fresh_after_ms")
     bars = [make_bar(results, key, "<=", 100.0) for key in keys]
     return [*bars, *(make_bar(results, key, "<=", bound) for key in ("others_age_ms_p99", "others_age_ms_p99_link"))]

@@ -6,11 +6,17 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iris_session.bench.baseline import measure_baseline
 from iris_session.bench.clients import ClientJob
-from iris_session.bench.harness import CLIENTS, Measurement, assign_links, group_clients, measure
-from iris_session.bench.report import BenchError, BenchReport, compute_percentile, make_bar, make_link_report
+from iris_session.bench.harness import (
+    WARM_UP_S,
+    Measurement,
+    compute_ages_ms,
+    measure,
+)
+from iris_session.bench.report import BenchError, BenchReport, make_bar, summarize_percentiles
 from iris_session.demo.scenes import free_bodies_scene
 
 #: The bar applies under input: this many of the clients send 3 devices x 72 Hz of samples.
@@ -32,46 +38,31 @@ def run_state(
 ) -> BenchReport:
     """Publish free bodies in motion without contact to observers, at 60 Hz.
 
-    Args:
-        clients: Number of observers.
-        bodies: Number of moving bodies.
-        seconds: Length of the measured window.
-        seed: Random seed.
-        curve: Encrypt and authenticate.
-        profile: Link profile of every client; results then include the link, and bars do not apply.
-        progress: Called with short texts.
-
-    Returns:
-        The report. Reference: `measure_baseline`.
+    Reference: `measure_baseline`.
     """
     model = free_bodies_scene(bodies, seed).compile()
-    specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS) for i in range(clients)]
-    specs, links = assign_links(specs, profile)
+    specs = [ClientJob(f"client{i}", "observer", samples=i < SENDERS, profile=profile) for i in range(clients)]
     progress("measuring the baseline of the machine: an empty loop that publishes to as many receivers")
     reference = None if profile else measure_baseline(clients)
-    groups = {CLIENTS: group_clients(specs)}
-    got = measure(model, groups, seconds, links=links, seed=seed, keep_poses=True, curve=curve, progress=progress)
+    got = measure(model, specs, seconds, seed=seed, keep_poses=True, curve=curve, progress=progress)
     progress("comparing every delivered frame with the state at its tick")
-    ages = np.concatenate([(log["handed_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
-    inside = np.concatenate([(log["published_ns"] - log["state_ns"]) * 1e-6 for log in got.logs.values()])
+    logs = list(got.logs.values())
+    ages = compute_ages_ms(logs)
     if not len(ages):
         raise BenchError("no client received state: increase --seconds")
     position_mm, rotation_deg = compute_errors(got)
-    messages = sum(int(log["counts"][3]) for log in got.logs.values())
-    total = sum(int(log["counts"][4]) for log in got.logs.values())
+    samples, _, _, messages, total = np.sum([log["counts"] for log in logs], axis=0).tolist()
+    inside = np.concatenate([(log["published_ns"] - log["state_ns"]) * 1e-6 for log in logs])
     results: dict[str, Any] = {
-        "delivered_hz_min": round(min(len(log["ticks"]) for log in got.logs.values()) / got.seconds, 2),
-        "age_ms_p50": compute_percentile(ages, 50),
-        "age_ms_p95": compute_percentile(ages, 95),
-        "age_ms_p99": compute_percentile(ages, 99),
-        "age_at_publish_ms_p50": compute_percentile(inside, 50),
-        "age_at_publish_ms_p99": compute_percentile(inside, 99),
+        "delivered_hz_min": round(min(len(log["ticks"]) for log in logs) / got.seconds, 2),
+        **summarize_percentiles("age_ms", ages, (50, 95, 99)),
+        **summarize_percentiles("age_at_publish_ms", inside),
         "bytes_per_frame": round(total / messages, 1),
         "bytes_per_body": round(total / messages / bodies, 2),
         "max_position_error_mm": round(position_mm, 5),
         "max_rotation_error_deg": round(rotation_deg, 5),
-        "client_cpu_share": round(float(np.mean([log["cpu_share"][0] for log in got.logs.values()])), 4),
-        "samples_per_s": round(sum(int(log["counts"][0]) for log in got.logs.values()) / (got.seconds + 3.0), 1),
+        "client_cpu_share": round(float(np.mean([log["cpu_share"][0] for log in logs])), 4),
+        "samples_per_s": round(samples / (got.seconds + WARM_UP_S), 1),
         **got.summarize(*SESSION_KEYS),
     }
     bars = [
@@ -82,22 +73,20 @@ def run_state(
         make_bar(results, "bytes_per_frame", "<=", 200.0 + 12.0 * bodies),  # 3,800 for 300 bodies
         make_bar(results, "delivered_hz_min", ">=", 59.0),
     ]
-    params = {"clients": clients, "bodies": bodies, "seconds": seconds, "seed": seed, "curve": curve, "hz": 60}
-    return make_link_report("state", params, results, bars, profile, reference)
+    return BenchReport(results, bars, reference, {"hz": 60})
 
 
 def compute_errors(got: Measurement) -> tuple[float, float]:
     """Return the largest position [mm] and rotation [deg] error of all bodies in all delivered frames."""
-    position = rotation = 0.0
-    for log in got.logs.values():
-        for tick, poses in zip(log["ticks"], log["poses"], strict=True):
-            truth = got.truth[int(tick)]
-            position = max(position, float(np.linalg.norm(poses[:, :3] - truth[:, :3], axis=1).max()))
-            rotation = max(rotation, _max_angle(poses[:, 3:], truth[:, 3:]))
-    return position * 1e3, float(np.degrees(rotation))
+    frames = [pair for log in got.logs.values() for pair in zip(log["ticks"].tolist(), log["poses"], strict=True)]
+    errors = [compute_pose_errors(poses, got.truth[tick]) for tick, poses in frames]
+    position_mm, rotation_deg = np.max(errors, axis=0).tolist()
+    return position_mm, rotation_deg
 
 
-def _max_angle(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
-    """Return the largest angle between two sets of unit quaternions (n, 4), by the chord, which is exact near zero."""
-    chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
-    return float(4.0 * np.arcsin(np.minimum(chord.max() / 2.0, 1.0)))
+def compute_pose_errors(poses: NDArray[np.float64], truth: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the largest position [mm] and rotation [deg] error of poses (n, 7). The chord is exact near zero."""
+    a, b = poses[:, 3:], truth[:, 3:]
+    chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1)).max()
+    position_m = np.linalg.norm(poses[:, :3] - truth[:, :3], axis=1).max()
+    return float(position_m) * 1e3, float(np.degrees(4.0 * np.arcsin(min(chord / 2.0, 1.0))))

@@ -19,26 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iris_session.authority import AuthorityConfig
+from iris_session.bench.operator import OPENING_STEPS, ScriptedOperator
 from iris_session.bench.report import BenchError, BenchReport, make_bar
 from iris_session.control import ControlConfig
-from iris_session.protocol.client_messages import Acquire, Control, EStop, Release, Sample, TrackingEpoch
-from iris_session.protocol.common import IDENTITY, Pose, Target
-from iris_session.protocol.entries import HOST, AlignmentProposal, Entry, EntryMessage, Join, Lost, SessionResumed
-from iris_session.protocol.names import CommandKind, Role
+from iris_session.protocol.client_messages import Control, EStop, Release, Sample, TrackingEpoch
+from iris_session.protocol.common import Pose, Target
+from iris_session.protocol.entries import HOST, Entry, EntryMessage, Lost, SessionResumed
+from iris_session.protocol.names import CommandKind
 from iris_session.protocol.specs import RobotSpec
 from iris_session.session.core import CoreConfig, SessionCore
 
 TICK_NS: Final = 2_000_000
-MS: Final = 1_000_000
 #: One sample in so many steps: 71 Hz.
 SAMPLE_STEPS: Final = 7
 FORCE_AFTER_S: Final = 0.2
 WALL_AFTER_S: Final = 0.5
 LUNGE_S: Final = 0.6
-MAX_PRESS_S: Final = 60.0
 MAX_FORCE_RATIO: Final = 0.3
 MAX_LUNGE_RAD: Final = 0.03
-_PILOT: Final = 1
+OPERATOR: Final = ScriptedOperator("controller/right", "arm")
 _LIMITS: Final = 'forcelimited="true" forcerange="-60 60"'
 #: One actuator by kind; `{0}` is the joint.
 ACTUATORS: Final = {
@@ -96,7 +95,7 @@ def measure_push(data: mujoco.MjData) -> NDArray[np.float64]:
 
 
 class Case(msgspec.Struct, frozen=True):
-    """One case: see the module."""
+    """Results of one kind of actuators and one cause of a hold: see the module."""
 
     force_ratio: float
     lunge_rad: float
@@ -133,8 +132,12 @@ class StopScenario:
     def now_ns(self) -> int:
         return (self.step_number + 1) * TICK_NS
 
-    def submit(self, message: EntryMessage, connection: int = _PILOT) -> Entry:
-        return Entry(connection, connection, self.now_ns, message)
+    def submit(self, message: EntryMessage) -> Entry:
+        return OPERATOR.make_entry(message, self.now_ns)
+
+    def control(self, message: EntryMessage) -> Entry:
+        """Return a message of the program that runs the session."""
+        return Entry(HOST, HOST, self.now_ns, message)
 
     def run(self, seconds: float, entries: Sequence[Entry] = (), n_ticks: int = 1) -> None:
         """Take steps for `seconds`; `entries` come with the first."""
@@ -143,14 +146,8 @@ class StopScenario:
             entries = ()
 
     def step(self, entries: Sequence[Entry] = (), n_ticks: int = 1) -> None:
-        opening: dict[int, EntryMessage] = {
-            0: Join("key", Role.OPERATOR, "ann", devices=("controller/right",)),
-            1: AlignmentProposal(IDENTITY, 0, tuple(1e-8 if i % 7 == 0 else 0.0 for i in range(36)), (0, 0, 0), 1e-3),
-            2: Acquire(1, ("arm",)),
-        }
-        first = opening.get(self.step_number)
-        entries_now = [*entries] if first is None else [*entries, self.submit(first)]
-        if self.sends and self.step_number > 3 and self.step_number % SAMPLE_STEPS == 0:
+        entries_now = [*entries, *OPERATOR.make_opening(self.step_number, self.now_ns)]
+        if self.sends and self.step_number > OPENING_STEPS and self.step_number % SAMPLE_STEPS == 0:
             entries_now.append(self.submit(self._make_sample()))
         self.outcome = self.core.step(self.now_ns, entries_now, n_ticks, digest=False)
         self.step_number += 1
@@ -170,20 +167,9 @@ class StopScenario:
 
     def _make_sample(self) -> Sample:
         pressed_s = (self.step_number - self.begin_step) * TICK_NS * 1e-9 if "clutch" in self.changes else 0.0
-        moved = 0.6 * min(1.0, pressed_s)
-        fields: dict[str, Any] = {
-            "device": "controller/right",
-            "kind": "pose",
-            "seq": self.step_number,
-            "capture_ns": self.now_ns,
-            "scene_epoch": 1,
-            "tracking_epoch": 0,
-            "alignment_version": 1,
-            "targets": (Target("arm", 1),),
-            "gripper": 0.5,
-            "pose": Pose((0.0, moved, 1.0 + 1e-9 * self.step_number), (1.0, 0.0, 0.0, 0.0)),
-        }
-        return Sample(**{**fields, **self.changes})
+        at = Pose((0.0, 0.6 * min(1.0, pressed_s), 1.0 + 1e-9 * self.step_number), (1.0, 0.0, 0.0, 0.0))
+        sample = OPERATOR.make_sample(at, self.now_ns, clutch=False)
+        return msgspec.structs.replace(sample, gripper=0.5, **self.changes)
 
     def _is_pressing(self) -> bool:
         command = self.outcome.decision.commands[0]
@@ -191,10 +177,10 @@ class StopScenario:
 
 
 def _pause(run: StopScenario) -> None:
-    run.step([run.submit(Control(0, "pause"), HOST)], 0)
+    run.step([run.control(Control(0, "pause"))], 0)
     run.sends = False
     run.run(0.2, n_ticks=0)
-    run.step([run.submit(Control(0, "resume"), HOST)])
+    run.step([run.control(Control(0, "resume"))])
 
 
 def _resume(run: StopScenario) -> None:
@@ -202,7 +188,7 @@ def _resume(run: StopScenario) -> None:
     run.core = run.make_core(run.kind)
     run.core.restore(state)
     run.sends = False
-    run.step([run.submit(SessionResumed(1_000_000_000), HOST)])
+    run.step([run.control(SessionResumed(1_000_000_000))])
 
 
 def _disconnect(run: StopScenario) -> None:
@@ -244,11 +230,10 @@ def run_case(run: StopScenario, cause: str) -> Case:
     else:
         raise BenchError(f"no hold began by {cause}")
     run.run(FORCE_AFTER_S)
-    after = 0.0
+    after, data = 0.0, run.core.world.data
     for _ in range(round((WALL_AFTER_S - FORCE_AFTER_S) * 1e9) // TICK_NS):
-        after = max(after, float(np.abs(measure_push(run.core.world.data)).max()))
+        after = max(after, float(np.abs(measure_push(data)).max()))
         run.step()
-    data = run.core.world.data
     remove_wall(data)
     q0, lunge, speed = data.qpos[:3].copy(), 0.0, 0.0
     for _ in range(round(LUNGE_S * 1e9) // TICK_NS):
@@ -260,13 +245,8 @@ def run_case(run: StopScenario, cause: str) -> Case:
 
 
 def run_stop(seconds: float = 1.0, progress: Callable[[str], None] = lambda _: None) -> BenchReport:
-    """Measure every kind of actuator and every cause of a hold.
-
-    Args:
-        seconds: Time for which each arm presses against the wall [s of simulation], at most `MAX_PRESS_S`.
-        progress: Called with short texts.
-    """
-    seconds = min(seconds, MAX_PRESS_S)
+    """Measure every kind of actuator and every cause of a hold."""
+    seconds = min(seconds, 60.0)
     cases: dict[str, dict[str, Case]] = {}
     for kind in KINDS:
         progress(kind)
@@ -287,4 +267,4 @@ def run_stop(seconds: float = 1.0, progress: Callable[[str], None] = lambda _: N
         make_bar(results, "worst_lunge_rad", "<=", MAX_LUNGE_RAD),
         make_bar(results, "grips_kept", ">=", len(every)),
     )
-    return BenchReport("stop", {"seconds": seconds}, results, bars)
+    return BenchReport(results, bars, params={"seconds": seconds})

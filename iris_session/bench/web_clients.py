@@ -43,8 +43,8 @@ class BenchBrowser:
         self._job = job
         hello = Hello(spec.role, spec.name, software="bench", alignment=AlignmentKind.NOT_NEEDED)
         identity = Identity.in_memory()
-        if job.secret:
-            identity.secret = make_web_secret(job.secret, spec.name)
+        if job.keys:
+            identity.secret = make_web_secret(job.keys, spec.name)
         self.connection = ClientConnection(hello, identity)
         self._ticket = ""
         self._socket: aiohttp.ClientWebSocketResponse | None = None
@@ -143,10 +143,8 @@ class BenchBrowser:
 class Browsers(Plugin):
     """Browsers of one process. Their loop runs while they are polled and while they are measured."""
 
-    job_type = Job
-
     def __init__(self, job: Job) -> None:
-        super().__init__(job)
+        self._job = job
         self._browsers = [BenchBrowser(job, spec) for spec in job.clients]
         self._loop = asyncio.new_event_loop()
         self._tasks: list[asyncio.Task[None]] = []  # which do not end by themselves
@@ -165,8 +163,8 @@ class Browsers(Plugin):
         for browser in self._browsers:
             browser.begin_ns, browser.end_ns = begin_ns, end_ns
             self._loads.append(self._loop.create_task(browser.load_at_times(self._http)))
-        self._loop.run_until_complete(self._run((end_ns - self.job.session_time_ns()) * 1e-9))
-        self.job.write_log({browser.spec.name: browser.to_columns() for browser in self._browsers})
+        self._loop.run_until_complete(self._run((end_ns - self._job.session_time_ns()) * 1e-9))
+        self._job.write_log({browser.spec.name: browser.to_columns() for browser in self._browsers})
 
     def close(self) -> None:
         """Leave the session."""

@@ -219,10 +219,8 @@ _PROBE: Final = """
 class Tab(Plugin):
     """One tab with its log."""
 
-    job_type = Job
-
     def __init__(self, job: Job) -> None:
-        super().__init__(job)
+        self._job = job
         self._name = job.clients[0].name
         self._chromium = Chromium(find_tools())
         self._heap: list[tuple[float, float, float]] = []
@@ -238,8 +236,8 @@ class Tab(Plugin):
 
     def _join(self) -> None:
         """Open the page, pair where the address has a code, and wait until the whole scene is drawn."""
-        self._call("open", url=self.job.page, before=[_PROBE], width=WIDTH, height=HEIGHT)
-        if "#c=" in self.job.page:
+        self._call("open", url=self._job.page, before=[_PROBE], width=WIDTH, height=HEIGHT)
+        if "#c=" in self._job.page:
             self._wait("document.querySelector('dialog').open")
             self._call("press", key="Enter")
         self._wait(_READY)
@@ -256,7 +254,7 @@ class Tab(Plugin):
             self._sleep_until(int(at_ns))
             self._read_memory((at_ns - begin_ns) * 1e-9)
         self._press_stops(end_ns)
-        self.job.write_log({self._name: self._read_columns()})
+        self._job.write_log({self._name: self._read_columns()})
 
     def _press_stops(self, end_ns: int) -> None:
         period_ns = round(STOPS_S * 1e9 / (STOPS + 1))
@@ -283,7 +281,7 @@ class Tab(Plugin):
     def _read_columns(self) -> dict[str, NDArray[Any]]:
         """Return the log. `clicks_ns`: session time of each click, as the browser has seen it."""
         found = self._call("evaluate", script="irisBench.end()")
-        offset_ns = time.time_ns() - time.monotonic_ns() + self.job.origin_ns
+        offset_ns = time.time_ns() - time.monotonic_ns() + self._job.origin_ns
         return {
             "js_ms": np.array(found["js_ms"]),
             "render_ms": np.array(found["render_ms"]),
@@ -301,4 +299,4 @@ class Tab(Plugin):
         self._call("wait", script=script, timeout_ms=1000 * timeout_s)
 
     def _sleep_until(self, session_ns: int) -> None:
-        time.sleep(max(0.0, (session_ns - self.job.session_time_ns()) * 1e-9))
+        time.sleep(max(0.0, (session_ns - self._job.session_time_ns()) * 1e-9))

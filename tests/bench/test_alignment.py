@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from iris_session.bench.alignment import SimulatedHeadset, run_alignment
+from anchors.pose import IDENTITY_POSE
+from iris_session.bench.alignment import observe_anchor, run_alignment
+from iris_session.bench.alignment_sources import HeadsetMotion, SheetSource
 from iris_session.bench.report import BenchReport
 
 
@@ -21,7 +23,7 @@ def test_estimator_is_better_than_naive_methods(report: BenchReport) -> None:
 
 def test_same_seed_gives_the_same_observations() -> None:
     one, same, other = (
-        SimulatedHeadset(np.random.default_rng(seed)).observe_sheet("a", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+        observe_anchor("one_sheet", HeadsetMotion(np.random.default_rng(seed), SheetSource()), "a", IDENTITY_POSE, 0)
         for seed in (1, 1, 2)
     )
     assert one == same != other

@@ -12,7 +12,7 @@ import pytest
 from anchors.pose import Vec3, compose, distance, quat_angle
 from iris_session.bench.alignment_room import ProbeResult, Room
 from iris_session.bench.alignment_sources import ONE, HeadsetMotion, SheetSource, to_array_pose
-from iris_session.bench.alignment_worlds import WORLDS, RoomResult, jump_silently, run_all, select_worlds, summarize
+from iris_session.bench.alignment_worlds import WORLDS, RoomResult, select_worlds, summarize, survey
 from iris_session.bench.report import BenchError
 from iris_session.emulator.sheet_noise import SheetNoise
 
@@ -63,10 +63,10 @@ def test_smoothed_and_repeated_poses() -> None:
 
 
 def test_wearers_of_a_plain_source_are_aligned_and_move_robots() -> None:
-    room = Room(np.random.default_rng(1), ONE, SheetSource())
+    room = Room(np.random.default_rng(1), ONE, SheetSource(), drift_m_per_min=0.003, marks={})
     room.probe()
     assert [f.is_allowed for _, f in room.findings] == [False] * 3, "nobody is aligned yet"
-    run_all(room, lambda p: p.survey("a"))
+    survey()(room)
     room.probe("then")
     for _, found in room.findings[3:]:
         assert found.is_allowed
@@ -76,8 +76,7 @@ def test_wearers_of_a_plain_source_are_aligned_and_move_robots() -> None:
 
 
 def test_who_is_told_of_a_jump_is_counted_and_does_not_drive() -> None:
-    room = Room(np.random.default_rng(2), ONE, SheetSource(hz=10.0))
-    jump_silently(room)
+    room = WORLDS["W3"][0].run(np.random.default_rng(2))
     first = [f for label, f in room.findings if not label]
     assert all(f.is_told for f in first)
     assert [p.false_alarms for p in room.people] == [0, 0]

@@ -9,6 +9,7 @@ import pytest
 
 from iris_session.bench.cloud_stream import plan_stream
 from iris_session.bench.harness import (
+    BASELINE,
     SHORTEST_STALL_S,
     Interval,
     compute_age_p99_ms,
@@ -17,9 +18,8 @@ from iris_session.bench.harness import (
     summarize_runs,
     summarize_stalls,
 )
-from iris_session.bench.slow_client import BASELINE, STALLED, STOPPED
-from iris_session.bench.web import FROZEN, LOADING, plan_web_intervals
-from iris_session.bench.web_tab import STOPS_S
+from iris_session.bench.slow_client import STALLED, STOPPED
+from iris_session.bench.web import FROZEN, LENGTHS_S, LOADING
 
 MS = 1_000_000
 BEGIN = 5_000 * MS
@@ -54,17 +54,17 @@ def test_ages_are_those_between_two_times() -> None:
 
 @pytest.mark.parametrize("seconds", [50.0, 1.0])
 def test_rounds_fill_the_time_and_leave_room_for_the_stalls(seconds: float) -> None:
-    plan = plan_rounds((BASELINE, STOPPED, STALLED), seconds, 3, SHORTEST_STALL_S)
+    plan = plan_rounds(dict.fromkeys((BASELINE, STOPPED, STALLED), SHORTEST_STALL_S), seconds, 3)
     assert [one.kind for one in plan] == [BASELINE, STOPPED, STALLED] * (3 if seconds == 50.0 else 1)
     assert plan[-1].end_s == max(seconds, 3 * SHORTEST_STALL_S)
     assert all(one.end_s - one.resume_s >= 1.0 - 1e-9 for one in plan)
 
 
 def test_plans_of_streams_and_browsers() -> None:
-    assert [one.kind for one in plan_stream(20.0, 0.0)] == ["without", "with"] * 4
-    assert plan_stream(20.0, 0.0)[-1].end_s == pytest.approx(20.0)
-    assert [one.kind for one in plan_stream(20.0, 5.0)] == ["with", "slow", "slow_without"]
-    plan = plan_web_intervals(65.0)
+    assert [one.kind for one in plan_stream(20.0)] == ["without", "with"] * 4
+    assert plan_stream(20.0)[-1].end_s == pytest.approx(20.0)
+    assert [one.kind for one in plan_stream(20.0, slow=True)] == ["with", "slow", "slow_without"]
+    plan = plan_rounds(LENGTHS_S, 57.0, 3)
     assert [one.kind for one in plan] == [BASELINE, FROZEN, LOADING] * 3
-    assert plan[-1].end_s + STOPS_S == 65.0
-    assert [len(plan_web_intervals(seconds)) for seconds in (1.0, 300.0)] == [3, 9]
+    assert plan[-1].end_s == 57.0
+    assert [len(plan_rounds(LENGTHS_S, seconds, 3)) for seconds in (1.0, 300.0)] == [3, 9]

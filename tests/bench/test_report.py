@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 
 from iris_session.bench import state
-from iris_session.bench.report import NO_BARS, BenchReport, make_bar, make_link_report
+from iris_session.bench.report import NO_BARS, BenchReport, make_bar
 from iris_session.cli.main import main
 
 
 def _report(value: float = 1.0) -> BenchReport:
     results = {"age_ms_p99": value, "extra": 1, "case": {"hz": 30.0}}
     bars = (make_bar(results, "age_ms_p99", "<=", 3.0), make_bar(results, "case.hz", ">=", 10.0))
-    return BenchReport("state", {"clients": 2}, results, bars)
+    return BenchReport(results, bars, params={"hz": 60})
 
 
 @pytest.fixture
@@ -66,6 +66,6 @@ def test_bar_is_kept_or_missed(value: float, ok: bool) -> None:
 
 
 def test_a_link_profile_leaves_no_bars() -> None:
-    plain, linked = (make_link_report("state", {}, {"a": 1}, _report().bars, profile) for profile in ("", "lan"))
-    assert (plain.params, len(plain.bars)) == ({}, 2)
-    assert (linked.params, linked.bars) == ({"profile": "lan", "bars": NO_BARS}, ())
+    plain, linked = (_report().complete("state", {"profile": profile}, 0.0, 1.0) for profile in ("", "lan"))
+    assert (plain.params, len(plain.bars)) == ({"hz": 60}, 2)
+    assert (linked.params, linked.bars) == ({"profile": "lan", "hz": 60, "bars": NO_BARS}, ())
