@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, Final
 from iris_session.cli import anchors_solve, calibrate
 from iris_session.cli.common import (
     CommandError,
+    Commands,
+    add_actions,
     add_address_options,
     add_command,
-    add_json_option,
     add_pose_option,
     find_participant,
     make_client,
@@ -48,12 +49,11 @@ ALL_PARTICIPANTS: Final = "all"
 MAX_LISTED_SHEETS: Final = 8
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `anchors`."""
-    parser = add_command(
+    actions = add_actions(
         commands,
         "anchors",
-        None,
         help="print anchor sheets, align headsets, calibrate cameras",
         description="Print sheets that headsets and cameras detect, align headsets to them, and calibrate cameras.",
         examples="""
@@ -66,7 +66,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session anchors calibrate-camera pictures --sheet table=150mm --at table=0,-0.45,0,1,0,0,0
         """,
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _register_print(actions)
     _register_example(actions)
     _register_status(actions)
@@ -77,7 +76,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     calibrate.register_camera(actions)
 
 
-def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_print(actions: Commands) -> None:
     """Add the action `print`."""
     one = add_command(
         actions,
@@ -108,10 +107,9 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
     one.add_argument("--id", default="table", metavar="NAME", help="id of the anchor (%(default)s)")
     one.add_argument("--paper", default="a4", metavar="PAPER", help="a5, a4, a3, a2, letter or tabloid (%(default)s)")
     one.add_argument("-o", "--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
-    add_json_option(one)
 
 
-def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_example(actions: Commands) -> None:
     """Add the action `example`."""
     one = add_command(
         actions,
@@ -133,7 +131,6 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
     )
     one.add_argument("--marks", action="store_true", help="of sheets with marks, as `print --marks` writes them")
     _add_layout_option(one)
-    add_json_option(one)
 
 
 def _add_layout_option(parser: argparse.ArgumentParser) -> None:
@@ -146,7 +143,7 @@ def _add_layout_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_status(actions: Commands) -> None:
     """Add the action `status`."""
     one = add_command(
         actions,
@@ -163,10 +160,9 @@ def _register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser
     )
     add_address_options(one)
     add_watch_options(one, one)
-    add_json_option(one)
 
 
-def _register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_align(actions: Commands) -> None:
     """Add the action `align`."""
     one = add_command(
         actions,
@@ -190,10 +186,9 @@ def _register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         help="name or id, or `all` (%(default)s)",
     )
     add_address_options(one, option=True)
-    add_json_option(one)
 
 
-def _register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_place(actions: Commands) -> None:
     """Add the action `place`."""
     one = add_command(
         actions,
@@ -211,10 +206,9 @@ def _register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]
     add_pose_option(one, "T_world_tracking, or the offset in the world")
     one.add_argument("--offset", action="store_true", help="the pose is an offset to the measured alignment")
     add_address_options(one, option=True)
-    add_json_option(one)
 
 
-def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_move(actions: Commands) -> None:
     """Add the action `move`."""
     one = add_command(
         actions,
@@ -232,7 +226,6 @@ def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser])
     add_pose_option(one, "T_world_anchor")
     one.add_argument("--force", action="store_true", help="allow more than 5 m from the present position")
     add_address_options(one, option=True)
-    add_json_option(one)
 
 
 def run_print(arguments: argparse.Namespace) -> int:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 from anchors.pose import pose_to_dict
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     pick_attributes,
     print_result,
     write_file,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MAX_LISTED: Final = 12
 
 
-def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(actions: Commands) -> None:
     """Add the action `solve`."""
     one = add_command(
         actions,
@@ -55,7 +55,6 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         "--anchors", type=Path, metavar="TOML", help="true poses of the anchors (default: those of the session)"
     )
     one.add_argument("--out", type=Path, metavar="FILE", help="write the poses of the sheets, for `serve --anchors`")
-    add_json_option(one)
 
 
 def run_solve(arguments: argparse.Namespace) -> int:

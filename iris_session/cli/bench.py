@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
-from iris_session.cli.common import CommandError, add_command, add_json_option, parse_seconds, print_result
+from iris_session.cli.common import CommandError, Commands, add_actions, add_command, parse_seconds, print_result
 
 if TYPE_CHECKING:
     from iris_session.bench.report import BenchReport
@@ -129,12 +129,12 @@ _TEXTS: Final = {
 _NOTES: Final = {("input", "operators"): ", one robot each", ("slow-client", "clients"): ", two of which are slow"}
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `bench`."""
-    parser = add_command(
+    names = add_actions(
         commands,
         "bench",
-        None,
+        metavar="NAME",
         help="run a benchmark and compare it with its bars",
         description="Measure with separate client processes. With --check, exit status 1 if a bar is missed. "
         "`iris-session bench NAME --help` has the options of one.",
@@ -150,12 +150,11 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session bench web --clients 8 --curve --check
         """,
     )
-    names = parser.add_subparsers(dest="bench", required=True, metavar="NAME")
     for name, one in _BENCHMARKS.items():
         _register_benchmark(names, name, one)
 
 
-def _register_benchmark(names: argparse._SubParsersAction[argparse.ArgumentParser], name: str, one: _Benchmark) -> None:
+def _register_benchmark(names: Commands, name: str, one: _Benchmark) -> None:
     example = f"iris-session bench {name} --check"
     parser = add_command(names, name, run, help=one.text, description=f"Measure: {one.text}.", examples=example)
     for option, default in one.options.items():
@@ -169,7 +168,6 @@ def _register_benchmark(names: argparse._SubParsersAction[argparse.ArgumentParse
             text = _TEXTS[option] + (" (default: %(default)s)" if default != "" else "")
             parser.add_argument(flag, type=kind, default=default, help=text)
     parser.add_argument("--check", action="store_true", help="exit status 1 if a bar is missed")
-    add_json_option(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -177,14 +175,14 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.bench.report import BenchError, measure_parallel_speed, read_stolen_time
     from iris_session.netsim.profiles import load_profile
 
-    name = arguments.bench.replace("-", "_")
+    name = arguments.action.replace("-", "_")
     function = getattr(importlib.import_module(f"iris_session.bench.{name}"), f"run_{name}")
     options = _check_options(arguments)
     if options.get("profile"):
         load_profile(options["profile"])  # fails before anything is started
 
     def progress(text: str) -> None:
-        print(f"bench {arguments.bench}: {text}", file=sys.stderr, flush=True)
+        print(f"bench {arguments.action}: {text}", file=sys.stderr, flush=True)
 
     speed = measure_parallel_speed()
     stolen_s, all_s = read_stolen_time()
@@ -202,15 +200,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _check_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the options of the benchmark. Raises `CommandError` for a number that a scene or session cannot have."""
-    one = _BENCHMARKS[arguments.bench]
+    one = _BENCHMARKS[arguments.action]
     options = {name: getattr(arguments, name) for name in one.options}
     limits = dict(one.limits)
     if "operators" in options:
         limits["operators"] = (1, arguments.robots)
     for name, (low, high) in limits.items():
         if not low <= options[name] <= high:
-            note = _NOTES.get((arguments.bench, name), "")
+            note = _NOTES.get((arguments.action, name), "")
             raise CommandError(
-                f"--{name.replace('_', '-')} {options[name]}: bench {arguments.bench} takes {low} to {high}{note}"
+                f"--{name.replace('_', '-')} {options[name]}: bench {arguments.action} takes {low} to {high}{note}"
             )
     return options

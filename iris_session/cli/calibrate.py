@@ -24,9 +24,9 @@ from anchors.camera_calibration import (
 from anchors.pose import pose_to_dict
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
-    add_json_option,
     make_client,
     make_number_type,
     parse_length,
@@ -150,7 +150,7 @@ def _list_poses(result: dict[str, Any]) -> list[tuple[str, dict[str, list[float]
 # --- anchors calibrate-camera -----------------------------------------------------------------------------------------
 
 
-def register_camera(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register_camera(actions: Commands) -> None:
     """Add the action `calibrate-camera`."""
     one = add_command(
         actions,
@@ -189,7 +189,6 @@ def register_camera(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         help="with --poses: known pose of the sheet on the hand, T_ee_sheet; one picture is enough",
     )
     one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
-    add_json_option(one)
 
 
 def run_camera(arguments: argparse.Namespace) -> int:
@@ -341,7 +340,7 @@ class CameraFrames(NamedTuple):
     frames: list[DepthFrame]
 
 
-def register_depth_cameras(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register_depth_cameras(actions: Commands) -> None:
     """Add the action `calibrate` of `cloud`."""
     parser = add_command(
         actions,
@@ -370,7 +369,6 @@ def register_depth_cameras(actions: argparse._SubParsersAction[argparse.Argument
     parser.add_argument("--icp", action="store_true", help="then fit several cameras to each other")
     parser.add_argument("--check", action="store_true", help="tell whether the poses of the camera file still fit")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the result as TOML, for the camera file")
-    add_json_option(parser)
 
 
 def run_depth_cameras(arguments: argparse.Namespace) -> int:

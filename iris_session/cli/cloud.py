@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any, Final
 from iris_session.cli import calibrate
 from iris_session.cli.common import (
     CommandError,
+    Commands,
+    add_actions,
     add_address_options,
     add_command,
-    add_json_option,
     make_client,
     parse_seconds,
     print_error,
@@ -46,12 +47,11 @@ QUIET_S: Final = 10.0
 log = logging.getLogger(__name__)
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `cloud` with its actions."""
-    parser = add_command(
+    actions = add_actions(
         commands,
         "cloud",
-        None,
         help="point clouds of depth cameras: run, example, inspect, calibrate",
         description="Show what depth cameras see as a point cloud in a session. `serve --camera FILE` does so by "
         "itself for cameras at its machine.",
@@ -64,18 +64,18 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session cloud inspect 192.168.1.20             what arrives here, and how old it is
         """,
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _register_run(actions)
     _register_example(actions)
     _register_inspect(actions)
     calibrate.register_depth_cameras(actions)
 
 
-def _register_run(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_run(actions: Commands) -> None:
     parser = add_command(
         actions,
         "run",
         run_file,
+        has_json=False,
         help="publish the cloud of a camera file in a session",
         description="Publish the cloud and the pictures of a camera file in a session until Ctrl-C. At an encrypted "
         "session the key of this user must be allowed in role camera: `iris-session pair --role camera` there.",
@@ -91,15 +91,15 @@ def _register_run(actions: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--json", action="store_true", help="one JSON object per second")
 
 
-def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_example(actions: Commands) -> None:
     from iris_session.cloud.example import SOURCES
 
     parser = add_command(
         actions,
         "example",
         run_example,
-        help="print a commented camera file",
-        description="Print a commented camera file, to be edited.",
+        has_json=False,
+        help="print a commented camera file, to be edited",
         examples="""
             iris-session cloud example > camera.toml
             iris-session cloud example --source realsense -o camera.toml
@@ -111,7 +111,7 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write it to a file that does not exist yet")
 
 
-def _register_inspect(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_inspect(actions: Commands) -> None:
     parser = add_command(
         actions,
         "inspect",
@@ -129,7 +129,6 @@ def _register_inspect(actions: argparse._SubParsersAction[argparse.ArgumentParse
     parser.add_argument("target", nargs="?", default="", metavar="FILE", help="camera file")
     add_address_options(parser, option=True)
     parser.add_argument("--seconds", type=parse_seconds, default=3.0, help="time to measure (default: %(default)s)")
-    add_json_option(parser)
 
 
 # --- run --------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from anchors.pose import quat_normalize
 from iris_session.protocol.errors import IrisError
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from iris_session.protocol.server_messages import ParticipantInfo
 
 N = TypeVar("N", int, float)
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 #: Bytes of each unit of a size.
 _BYTES: Final = {
@@ -118,40 +119,55 @@ def parse_budget(text: str) -> int:
 
 
 def add_command(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    commands: Commands,
     name: str,
-    run: Callable[[argparse.Namespace], int] | None,
+    run: Callable[[argparse.Namespace], int],
     *,
     help: str,
-    description: str,
+    description: str = "",
     examples: str,
     notes: str = "",
+    has_json: bool = True,
 ) -> argparse.ArgumentParser:
-    """Add a command, or an action of one.
+    """Add a command, or an action of one, and return its parser.
 
     Args:
         commands: Commands or actions to add it to.
         name: Its name.
-        run: Function that runs it and returns the exit status; `None` for a command that has actions.
+        run: Function that runs it and returns the exit status.
         help: Its line in the list of commands.
-        description: What it does, at the top of its help.
+        description: What it does, at the top of its help (default: `help`).
         examples: Examples, one a line, at the end of its help; may be indented.
         notes: Text before the examples.
-
-    Returns:
-        The parser, for its options.
+        has_json: Add `--json`, which `print_result` obeys.
     """
+    parser = _add_parser(commands, name, help, description, examples, notes)
+    parser.set_defaults(run=run)
+    if has_json:
+        add_json_option(parser)
+    return parser
+
+
+def add_actions(
+    commands: Commands, name: str, *, help: str, description: str = "", examples: str, metavar: str = "ACTION"
+) -> Commands:
+    """Add a command that has actions, and return them; the arguments are those of `add_command`."""
+    parser = _add_parser(commands, name, help, description, examples, "")
+    return parser.add_subparsers(dest="action", required=True, metavar=metavar)
+
+
+def _add_parser(
+    commands: Commands, name: str, help: str, description: str, examples: str, notes: str
+) -> argparse.ArgumentParser:
     lines = inspect.cleandoc(examples).split("\n")
     title = "examples" if len(lines) > 1 else "example"
     epilog = f"{notes}\n\n" * bool(notes) + "\n  ".join((f"{title}:", *lines))
     form = argparse.RawDescriptionHelpFormatter
-    parser = commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=form)
-    if run is not None:
-        parser.set_defaults(run=run)
-    return parser
+    description = description or f"{help[0].upper()}{help[1:]}."
+    return commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=form)
 
 
-def add_json_option(parser: argparse.ArgumentParser) -> None:
+def add_json_option(parser: argparse._ActionsContainer) -> None:
     """Add `--json`."""
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 

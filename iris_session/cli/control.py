@@ -18,9 +18,9 @@ import msgspec
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
-    add_json_option,
     describe_error,
     find_participant,
     make_client,
@@ -53,7 +53,7 @@ Outcome = tuple[str, dict[str, Any]]
 Action = Callable[["Client", argparse.Namespace], Outcome]
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the commands `estop`, `clear-estop`, `pause`, `resume`, `reset`, `assign`, `release`, `mode`, `rename`,
     `role`, `episode` and `marker`.
     """
@@ -122,20 +122,16 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     marker.set_defaults(roles=ALL_ROLES)
 
 
-def _add_command(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, text: str, act: Action, *examples: str
-) -> argparse.ArgumentParser:
+def _add_command(commands: Commands, name: str, text: str, act: Action, *examples: str) -> argparse.ArgumentParser:
     parser = add_command(
         commands,
         name,
         run,
         help=text,
-        description=f"{text[0].upper()}{text[1:]}. The session is the one on this machine, or that of --address or "
-        "--session.",
+        notes="The session is the one on this machine, or that of --address or --session.",
         examples="\n".join(f"iris-session {example}" for example in (*examples, f"{examples[0]} --session lab-1")),
     )
     add_address_options(parser, option=True)
-    add_json_option(parser)
     parser.set_defaults(act=act, roles=DIRECTORS)
     return parser
 

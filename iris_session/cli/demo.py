@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     add_session_options,
     make_number_type,
     open_scene,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _FIELDS = {"from": "giver", "to": "receiver"}
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `demo`."""
     parser = add_command(
         commands,
@@ -98,7 +98,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="delay of every operator's link, each way",
     )
     add_session_options(parser)
-    add_json_option(parser)
     parser.set_defaults(control_port=0, state_port=0)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import add_address_options, add_command, add_json_option, print_result
+from iris_session.cli.common import Commands, add_address_options, add_command, print_result
 from iris_session.protocol.names import Role
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ PROBLEM_STATES: Final = ("failed", "warning", "skipped")
 MARKS: Final = {"ok": "ok     ", "warning": "WARNING", "failed": "FAILED ", "skipped": "-      "}
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `doctor`."""
     parser = add_command(
         commands,
@@ -45,7 +45,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--record", type=Path, default=Path("sessions"), metavar="DIR", help="--server: folder of recordings"
     )
     parser.add_argument("--all", action="store_true", help="also print skipped checks")
-    add_json_option(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ import os
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
     check_session_reachable,
@@ -15,12 +16,13 @@ from iris_session.cli.common import (
 )
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `emulate`."""
     parser = add_command(
         commands,
         "emulate",
         run,
+        has_json=False,
         help="join with emulated headsets",
         description="Emulated operators join a session: each has its own tracking frame, observes the sheet until it "
         "is aligned, acquires a robot and works. Ends when every operator with a task is done, or after --seconds.",

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from iris_session.cli.common import CommandError, add_command, add_json_option, pick_attributes, print_result
+from iris_session.cli.common import CommandError, Commands, add_actions, add_command, pick_attributes, print_result
 from iris_session.cli.pair import add_role_option, parse_roles
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import CURVE
@@ -17,12 +17,11 @@ if TYPE_CHECKING:
     from iris_session.web.certificate import Certificate
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `keys`."""
-    parser = add_command(
+    actions = add_actions(
         commands,
         "keys",
-        None,
         help="list, allow and revoke the keys that may join",
         description="Manage the keys that may join encrypted sessions of this user, and show the user's own keys. "
         "Running sessions apply changes within half a second: a revoked key is disconnected at once.",
@@ -34,20 +33,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session keys show                                 fingerprints of this user
         """,
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    one = add_command(
-        actions,
-        "list",
-        run_list,
-        help="keys that may join",
-        description="List the keys that may join.",
-        examples="iris-session keys list --json",
-    )
-    add_json_option(one)
+    add_command(actions, "list", run_list, help="list the keys that may join", examples="iris-session keys list --json")
     one = add_command(
         actions,
         "allow",
         run_allow,
+        has_json=False,
         help="allow a key",
         description="Add a key to the list, or change its roles. Without a key: this user's own, to direct too.",
         examples="""
@@ -67,24 +58,24 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         actions,
         "revoke",
         run_revoke,
+        has_json=False,
         help="revoke a key",
         description="Remove a key from the list; participants who use it are disconnected.",
         examples="iris-session keys revoke quest-3",
     )
     one.add_argument("name", help="name or fingerprint in the list")
-    one = add_command(
+    add_command(
         actions,
         "show",
         run_show,
-        help="own fingerprints",
-        description="Show the folder of keys, and the user's own keys.",
+        help="show the folder of keys, and the user's own keys",
         examples="iris-session keys show",
     )
-    add_json_option(one)
     one = add_command(
         actions,
         "forget",
         run_forget,
+        has_json=False,
         help="forget the key of a server",
         description="Remove the stored key of a session's address, so that a new key can be trusted.",
         examples="iris-session keys forget 192.168.1.20:7721",

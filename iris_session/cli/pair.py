@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 from iris_session.cli.common import (
     ABOVE_0,
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     make_number_type,
     print_error,
     print_json,
@@ -41,7 +41,7 @@ FAILURE_TEXTS: Final = {
 }
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `pair`."""
     parser = add_command(
         commands,
@@ -94,7 +94,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--web-cert", default="", metavar="FILE", help="certificate of the page (default: this user's own)"
     )
     parser.add_argument("--no-wait", action="store_true", help="do not wait until the code is used")
-    add_json_option(parser)
 
 
 def add_role_option(parser: argparse.ArgumentParser) -> None:

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
-    add_json_option,
     check_session_reachable,
     ending_as_interrupts,
     make_client,
@@ -49,7 +49,7 @@ DRIVEN, INTERVENTION, WAITING = "driven", "intervention", "waiting"
 Observation = Mapping[str, Any]
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `policy`."""
     parser = add_command(
         commands,
@@ -74,7 +74,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument("--task", default="", help="task in words, for policies that read it")
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
     add_address_options(parser, option=True)
-    add_json_option(parser)
 
 
 class LeRobotPolicy:

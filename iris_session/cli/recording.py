@@ -14,8 +14,9 @@ from iris_session.cli import recording_episodes, recording_export, recording_ren
 from iris_session.cli.common import (
     MOST_LINES,
     CommandError,
+    Commands,
+    add_actions,
     add_command,
-    add_json_option,
     ending_as_interrupts,
     list_first,
     print_error,
@@ -43,13 +44,12 @@ _CLASSES: Final = {
 }
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the commands `verify` and `recording`."""
     _register_verify(commands)
-    parser = add_command(
+    actions = add_actions(
         commands,
         "recording",
-        None,
         help="inspect, view, verify, export, render or repair recordings",
         description="Show what a recording holds, view and verify it, export it as tables, make a film or a picture of "
         "it, or repair it. `iris-session view` and `iris-session verify` are short for the actions of that name.",
@@ -64,7 +64,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session recording repair session.rrd -o repaired.rrd
         """,
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     inspect = add_command(
         actions,
         "inspect",
@@ -80,7 +79,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         """,
     )
     inspect.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it")
-    add_json_option(inspect)
     recording_episodes.register(actions)
     view.register(actions)
     _register_verify(actions)
@@ -102,7 +100,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     repair.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
     repair.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the file to write")
     repair.add_argument("--force", action="store_true", help="replace FILE if it exists")
-    add_json_option(repair)
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
@@ -370,7 +367,7 @@ def format_repair(report: RepairReport) -> Iterator[str]:
 # --- verify -----------------------------------------------------------------------------------------------------------
 
 
-def _register_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_verify(commands: Commands) -> None:
     parser = add_command(
         commands,
         "verify",
@@ -385,7 +382,6 @@ def _register_verify(commands: argparse._SubParsersAction[argparse.ArgumentParse
     parser.add_argument(
         "files", nargs="+", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it"
     )
-    add_json_option(parser)
 
 
 def run_verify(arguments: argparse.Namespace) -> int:

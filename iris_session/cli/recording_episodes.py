@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_command,
     add_json_option,
     ending_as_interrupts,
@@ -32,12 +33,13 @@ WIDTH: Final = 100
 _EDITS: Final = ("drop", "keep", "trim", "label", "task", "reset")
 
 
-def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(actions: Commands) -> None:
     """Add the action `episodes` of `recording`."""
     parser = add_command(
         actions,
         "episodes",
         run,
+        has_json=False,
         help="list the episodes of recordings with their numbers, and choose those that are exported",
         description="List the episodes of recordings: verdict, length, people, handovers, share of time in which no "
         "robot was engaged, clutches, rejected samples, path of each end effector, least distance of two, "
@@ -62,7 +64,7 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     parser.add_argument("--size", type=parse_size, metavar="WxH", help="of their pictures (default: 640x480)")
     parser.add_argument("--verify", action="store_true", help="simulate every recording again, and mark what differs")
     output = parser.add_mutually_exclusive_group()
-    add_json_option(output)  # type: ignore[arg-type]
+    add_json_option(output)
     output.add_argument("--csv", action="store_true", help="print a table with all numbers, one line an episode")
     output.add_argument("--page", action="store_true", help="list them in a browser on this machine, until Ctrl-C")
     port = make_number_type(int, "a port: give 0 to 65535", 0, 65535)

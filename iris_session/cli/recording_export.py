@@ -12,8 +12,8 @@ from iris_session.cli.common import (
     ABOVE_0,
     MOST_LINES,
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     ending_as_interrupts,
     make_number_type,
     print_result,
@@ -28,7 +28,7 @@ FORMATS: Final = ("csv", "parquet", "npz")
 ASSETS: Final = "assets"
 
 
-def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(actions: Commands) -> None:
     """Add the command `export`, and the action of `recording`, which are the same."""
     parser = add_command(
         actions,
@@ -74,7 +74,6 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         help="only tables of this kind; repeatable",
     )
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty, replace its files")
-    add_json_option(parser)
     recording_dataset.add_options(parser)
 
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     ending_as_interrupts,
     make_number_type,
     print_result,
@@ -40,7 +40,7 @@ _CODECS: Final = {"vp09": "VP9", "mp4v": "MPEG-4 Part 2, which no browser plays"
 _SECOND: Final = 1_000_000_000
 
 
-def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(actions: Commands) -> None:
     """Add the action `render` of `recording`."""
     parser = add_command(
         actions,
@@ -82,7 +82,6 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     )
     parser.add_argument("--people", action="store_true", help="draw heads and hands too, in their colours in `view`")
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
-    add_json_option(parser)
 
 
 def parse_size(text: str) -> tuple[int, int]:

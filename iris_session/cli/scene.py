@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from iris_session.cli.common import (
     ABOVE_0,
     CommandError,
+    Commands,
+    add_actions,
     add_command,
-    add_json_option,
     make_number_type,
     open_scene,
     print_json,
@@ -41,15 +42,13 @@ class _ParsedScene(NamedTuple):
     notes: tuple[str, ...]
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the commands `robots` and `scene`."""
     _register_robots(commands)
-    parser = add_command(
+    actions = add_actions(
         commands,
         "scene",
-        None,
         help="inspect what clients receive of a scene, or export it to GLB",
-        description="Inspect what clients receive of a scene, or export it to GLB.",
         examples="""
             iris-session scene inspect scene.xml
             iris-session scene inspect arm.urdf
@@ -57,7 +56,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session scene export handover handover.glb
         """,
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     inspect = add_command(
         actions,
         "inspect",
@@ -70,7 +68,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         """,
     )
     _add_scene_arguments(inspect)
-    add_json_option(inspect)
     export = add_command(
         actions,
         "export",
@@ -81,10 +78,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     _add_scene_arguments(export)
     export.add_argument("out", type=Path, metavar="OUT.glb", help="file to write")
-    add_json_option(export)
 
 
-def _register_robots(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_robots(commands: Commands) -> None:
     parser = add_command(
         commands,
         "robots",
@@ -100,7 +96,6 @@ def _register_robots(commands: argparse._SubParsersAction[argparse.ArgumentParse
     )
     parser.add_argument("scene", help="MJCF or MJB file, or the name of a scene (see `iris-session serve --help`)")
     parser.add_argument("--all", action="store_true", help="also legs, heads and fingers, which are not offered")
-    add_json_option(parser)
 
 
 def run_robots(arguments: argparse.Namespace) -> int:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     add_session_options,
     format_scene_names,
     open_scene,
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from iris_session.session.session import Session
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `serve`."""
     parser = add_command(
         commands,
@@ -128,7 +128,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     add_file_options(parser)
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
     add_session_options(parser)
-    add_json_option(parser)
 
 
 def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
-    add_json_option,
     list_first,
     make_client,
     parse_seconds,
@@ -33,7 +33,7 @@ JOIN_S: Final = 4.0
 FIRST_REPORT_S: Final = 1.2
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the commands `sessions` and `status`."""
     _register_sessions(commands)
     parser = add_command(
@@ -54,10 +54,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     add_watch_options(form, parser)
     form.add_argument("--prometheus", action="store_true", help="print metrics in the text format of Prometheus, once")
     form.add_argument("--metrics-port", type=int, metavar="PORT", help="serve the metrics on 127.0.0.1 over HTTP")
-    add_json_option(parser)
 
 
-def _register_sessions(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_sessions(commands: Commands) -> None:
     parser = add_command(
         commands,
         "sessions",
@@ -71,7 +70,6 @@ def _register_sessions(commands: argparse._SubParsersAction[argparse.ArgumentPar
         """,
     )
     parser.add_argument("--seconds", type=parse_seconds, default=1.0, help="listen this long (default: %(default)g)")
-    add_json_option(parser)
 
 
 def run_sessions(arguments: argparse.Namespace) -> int:

@@ -18,6 +18,7 @@ from urllib.parse import quote
 from iris_session.cli.common import (
     MOST_LINES,
     CommandError,
+    Commands,
     add_command,
     ending_as_interrupts,
     print_error,
@@ -43,12 +44,13 @@ LIVE_NICE: Final = 10
 MOST_WORDS: Final = 10_000
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `view`."""
     parser = add_command(
         commands,
         "view",
         run,
+        has_json=False,
         help="show a recording in Rerun's viewer",
         description="Show a recording in Rerun's viewer: the whole session, with its parts and resumed recordings, "
         "also if it was killed, cut or damaged. A copy that opens at once is kept beside it (session.view.rrd); the "

@@ -6,6 +6,7 @@ import argparse
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
     add_page_options,
@@ -17,12 +18,13 @@ from iris_session.system.extras import require_package
 CONNECT_S = 15.0
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def register(commands: Commands) -> None:
     """Add the command `web`."""
     parser = add_command(
         commands,
         "web",
         run,
+        has_json=False,
         help="serve the page for browsers for a session on another machine",
         description="Serve the page for browsers, and the gateway behind it, for a session on another machine. A "
         "session of this machine does so by itself. At an encrypted session the key of this user must be allowed in "
