@@ -89,8 +89,10 @@ def make_number_type(kind: Callable[[str], N], wanted: str, low: float, high: fl
     return parse
 
 
-#: Types of options: a duration [s], and `--port-base`.
+#: Types of options: a duration [s], ports, and `--port-base`.
 parse_seconds: Final = make_number_type(float, "a duration: give seconds above 0, for example 30", ABOVE_0)
+parse_port: Final = make_number_type(int, "a port: give 1 to 65535", 1, 65535)
+parse_free_port: Final = make_number_type(int, "a port: give 1 to 65535, or 0 for any free one", 0, 65535)
 parse_port_base: Final = make_number_type(int, "a base of seven ports: give 1 to 65529, for example 7730", 1, 65529)
 
 
@@ -237,6 +239,13 @@ def make_client(arguments: argparse.Namespace, role: str, name: str) -> Client:
     )
 
 
+def refuse_options(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Raise `CommandError` if some of these options are given: their list, then `why`."""
+    given = ", ".join(f"--{name}" for name in names if getattr(arguments, name))
+    if given:
+        raise CommandError(f"{given}{why}")
+
+
 def find_participant(client: Client, name: str) -> ParticipantInfo:
     """Return the participant with an id or name.
 
@@ -278,27 +287,21 @@ def describe_error(error: IrisError) -> str:
 
 
 def add_session_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of commands that open a session."""
+    """Add the options of commands that open a session. Most are stored under the name of a field of `SessionConfig`,
+    and are `None` if not given.
+    """
     group = parser.add_argument_group("session")
     group.add_argument("--name", help="name of the session (default: that of the scene)")
-    group.add_argument(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDR",
-        help="address to listen on, 0.0.0.0 for all (default: %(default)s)",
-    )
+    group.add_argument("--host", metavar="ADDR", help="address to listen on, 0.0.0.0 for all (default: 127.0.0.1)")
     group.add_argument(
         "--interface",
+        dest="interfaces",
         action="append",
-        default=[],
         metavar="NAME_OR_ADDR",
         help="network to listen on instead of --host: a name like eth0, or an address; repeatable",
     )
     group.add_argument(
-        "--advertise",
-        default="",
-        metavar="ADDR",
-        help="address announced to clients, behind a router that forwards ports",
+        "--advertise", metavar="ADDR", help="address announced to clients, behind a router that forwards ports"
     )
     group.add_argument(
         "--port-base",
@@ -306,20 +309,25 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="block of ports: introduction N, control N+1, state N+2, ... N+6 (default: 7720)",
     )
-    group.add_argument("--no-beacon", action="store_true", help="do not announce the session on the network")
+    no_beacon = "do not announce the session on the network"
+    group.add_argument("--no-beacon", dest="beacon_port", action="store_const", const=0, help=no_beacon)
     group.add_argument("--control-port", type=int, metavar="PORT", help="0: any free port")
     group.add_argument("--state-port", type=int, metavar="PORT", help="0: any free port")
     group.add_argument("--curve", action="store_true", help="encrypt on loopback too, and admit listed keys only")
     group.add_argument(
         "--curve-key",
-        default="",
         metavar="FILE",
         help="secret key of the session for encryption, a ZeroMQ certificate *.key_secret that only you can read "
         "(default: your own, made on first use; `iris-session keys show` has its fingerprint)",
     )
-    group.add_argument("--record", metavar="FILE", help="path of the recording (default: below sessions/)")
+    record = group.add_mutually_exclusive_group()
+    record.add_argument(
+        "--record", type=parse_recording_name, metavar="FILE", help="path of the recording (default: below sessions/)"
+    )
+    record.add_argument("--no-record", dest="record", action="store_const", const=False, help="record nothing")
     group.add_argument(
         "--record-clouds",
+        dest="record_clouds_hz",
         type=parse_cloud_rate,
         metavar="RATE",
         help="frames per second of each point cloud and picture in the recording, or off (default: 2Hz)",
@@ -332,21 +340,20 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--record-budget",
+        dest="record_budget_bytes",
         type=parse_budget,
         metavar="SIZE",
         help="size that the recording may have, such as 20GB; the session goes on without one then (default: no limit)",
     )
     group.add_argument(
         "--curve-clients",
-        default="",
         metavar="DIR",
         help="folder of public ZeroMQ certificates *.key: these keys may join, in every role, and no other; there is "
         "no pairing and no page then (default: the keys of `iris-session keys list`)",
     )
-    add_page_options(group)
-    group.add_argument("--no-record", action="store_true", help="record nothing")
+    add_page_options(group, parse_free_port)
     group.add_argument("--view", action="store_true", help="show the recording in Rerun's viewer while it is written")
-    group.add_argument("--no-web", action="store_true", help="serve no page for browsers")
+    group.add_argument("--no-web", dest="web", action="store_false", help="serve no page for browsers")
     group.add_argument(
         "--groups",
         type=parse_groups,
@@ -365,6 +372,13 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), help="lease mode of every robot")
 
 
+def parse_recording_name(text: str) -> str:
+    """Parse `--record`."""
+    if not text.endswith(".rrd"):
+        raise argparse.ArgumentTypeError(f"{text!r}: a recording is one file: give a name that ends in .rrd")
+    return text
+
+
 def parse_groups(text: str) -> tuple[int, ...]:
     """Parse numbers of groups, separated by commas."""
     parts = text.split(",")
@@ -378,9 +392,9 @@ def parse_sites(text: str) -> bool | tuple[int, ...]:
     return text == "all" if text in ("all", "none") else parse_groups(text)
 
 
-def add_page_options(group: argparse._ActionsContainer) -> None:
-    """Add the options of the page for browsers, for `serve`, `demo` and `web`."""
-    group.add_argument("--web-port", type=int, metavar="PORT", help="port of the page for browsers (default: 7725)")
+def add_page_options(group: argparse._ActionsContainer, port: Callable[[str], int]) -> None:
+    """Add the options of the page for browsers, for `serve`, `demo` and `web`. `port`: type of its port."""
+    group.add_argument("--web-port", type=port, metavar="PORT", help="port of the page for browsers (default: 7725)")
     group.add_argument(
         "--web-cert", default="", metavar="FILE", help="certificate for HTTPS, PEM (default: one of this user's own)"
     )

@@ -17,6 +17,7 @@ from iris_session.cli.common import (
     open_scene,
     parse_seconds,
     print_result,
+    refuse_options,
 )
 from iris_session.cli.view import live_viewer
 
@@ -25,10 +26,6 @@ if TYPE_CHECKING:
     from iris_session.demo.demos import Demo
     from iris_session.demo.run import DemoResult
     from iris_session.session.session import Session
-
-
-#: Options whose fields have another name, as `from` is a keyword.
-_FIELDS = {"from": "giver", "to": "receiver"}
 
 
 def register(commands: Commands) -> None:
@@ -64,12 +61,11 @@ def register(commands: Commands) -> None:
     parser.add_argument("scene", nargs="?", help="for handover: your scene, a file or a name as of `serve`")
     plan = parser.add_argument_group("handover in your scene")
     plan.add_argument("--object", default="", metavar="NAME", help="the object (default: the only free body)")
-    plan.add_argument("--from", dest="giver", default="", metavar="ROBOT", help="who gives (default: the nearest)")
-    plan.add_argument("--to", dest="receiver", default="", metavar="ROBOT", help="who takes (default: the other)")
+    plan.add_argument("--from", default="", metavar="ROBOT", help="who gives (default: the nearest)")
+    plan.add_argument("--to", default="", metavar="ROBOT", help="who takes (default: the other)")
     plan.add_argument(
         "--episodes",
         type=make_number_type(int, "a number of handovers: give 1 to 1000", 1, 1000),
-        default=1,
         metavar="N",
         help="handovers; with several the object lies a little elsewhere in each (default: 1)",
     )
@@ -112,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
     if profile:
         load_profile(profile)  # fails before anything is started
     play = _make_demo(arguments)
-    timeout_s = arguments.timeout or 150.0 + 60.0 * (arguments.episodes - 1)
+    timeout_s = arguments.timeout or 90.0 + 60.0 * (arguments.episodes or 1)
     config = make_session_config(arguments, arguments.demo)
     out = sys.stderr if arguments.json else sys.stdout
 
@@ -135,11 +131,9 @@ def _make_demo(arguments: argparse.Namespace) -> Demo:
     """Return the demo of the arguments: a packaged one, or the handover in a scene."""
     from iris_session.demo.demos import make_demo, make_planned_handover
 
-    given = [f"--{name}" for name in ("object", "from", "to") if getattr(arguments, _FIELDS.get(name, name))]
-    given += ["--episodes"] if arguments.episodes > 1 else []
     if arguments.scene is None:
-        if given:
-            raise CommandError(f"{', '.join(given)}: name the scene, such as `iris-session demo handover scene.xml`")
+        why = ": name the scene, such as `iris-session demo handover scene.xml`"
+        refuse_options(arguments, ("object", "from", "to", "episodes"), why)
         return make_demo(arguments.demo, arguments.operators, arguments.observers, arguments.seed)
     if arguments.demo != "handover":
         raise CommandError(f"demo {arguments.demo} has its own scene: `iris-session demo handover {arguments.scene}`")
@@ -148,9 +142,9 @@ def _make_demo(arguments: argparse.Namespace) -> Demo:
     return make_planned_handover(
         open_scene(arguments.scene),
         arguments.object,
-        arguments.giver,
-        arguments.receiver,
-        episodes=arguments.episodes,
+        getattr(arguments, "from"),
+        arguments.to,
+        episodes=arguments.episodes or 1,
         observers=arguments.observers,
         seed=arguments.seed,
     )

@@ -15,6 +15,7 @@ from iris_session.cli.common import (
     Commands,
     add_command,
     make_number_type,
+    parse_port,
     print_error,
     print_json,
     print_result,
@@ -85,7 +86,7 @@ def register(commands: Commands) -> None:
     )
     parser.add_argument(
         "--web-port",
-        type=int,
+        type=parse_port,
         metavar="PORT",
         help="port of the page (default: as the session has said, or by --address)",
     )
@@ -119,8 +120,6 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.security import KeyHome, load_secret
     from iris_session.web.config import format_page_address
 
-    if arguments.web_port is not None and not 0 < arguments.web_port < 65536:
-        raise CommandError(f"--web-port {arguments.web_port} is not a port: give 1 to 65535")
     home = KeyHome()
     key = load_secret(arguments.curve_key) if arguments.curve_key else home.load_server_key()
     session, places, web = _find_addresses(arguments, home, key)

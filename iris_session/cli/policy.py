@@ -24,6 +24,7 @@ from iris_session.cli.common import (
     check_session_reachable,
     ending_as_interrupts,
     make_client,
+    make_number_type,
     parse_seconds,
     print_json,
 )
@@ -69,7 +70,8 @@ def register(commands: Commands) -> None:
         "--camera", action="append", default=[], metavar="NAME",
         help="a camera of the session, repeatable (default: those that the policy needs)",
     )  # fmt: skip
-    parser.add_argument("--hz", type=float, default=HZ, help="steps a second, as in the data set (%(default)g)")
+    rate = make_number_type(float, "a rate: give 1 to 240 steps a second, for example 30", 1.0, 240.0)
+    parser.add_argument("--hz", type=rate, default=HZ, help="steps a second, as in the data set (%(default)g)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:1, ... (%(default)s)")
     parser.add_argument("--task", default="", help="task in words, for policies that read it")
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
@@ -179,8 +181,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Drive until Ctrl-C or `--seconds`. Exit status 0, or 1 when the session has ended."""
     from iris_session.client.robot_env import RobotEnv
 
-    if not 1.0 <= arguments.hz <= 240.0:
-        raise CommandError(f"--hz {arguments.hz:g}: 1 to 240 are possible")
     check_session_reachable(arguments)
     policy = LeRobotPolicy(arguments.repo, arguments.device, arguments.task)
     images = "observation.images."

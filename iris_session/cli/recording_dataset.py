@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from iris_session.dataset.run import DatasetReport
 
 LABELS: Final = ("success", "failure", "unknown")
-#: Options that only data sets have, with the values that stand for "not given".
-_OPTIONS: Final = {
-    **dict.fromkeys(("fps", "cameras", "size", "looks", "seed", "labels", "task", "jobs", "ray")),
-    **dict.fromkeys(("plain", "depth", "masks", "anonymise"), False),
-}
+#: Options that only data sets have.
+OPTIONS: Final = (
+    *("fps", "cameras", "size", "looks", "seed", "labels", "task", "jobs", "ray"),
+    *("plain", "depth", "masks", "anonymise"),
+)
 DEFAULT_FPS: Final = 30
 DEFAULT_SIZE: Final = (640, 480)
 
@@ -60,11 +60,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="a Ray cluster makes the episodes, a task each: local (this machine), auto, HOST:PORT or ray://HOST:PORT; "
         "--jobs is then the number of tasks at once",
     )
-
-
-def list_given(arguments: argparse.Namespace) -> list[str]:
-    """Return the options of data sets that were given."""
-    return [f"--{name}" for name, absent in _OPTIONS.items() if getattr(arguments, name) != absent]
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -15,7 +15,7 @@ from iris_session.cli.common import (
     add_command,
     add_json_option,
     ending_as_interrupts,
-    make_number_type,
+    parse_free_port,
     print_error,
     print_json,
     to_printable,
@@ -67,8 +67,9 @@ def register(actions: Commands) -> None:
     add_json_option(output)
     output.add_argument("--csv", action="store_true", help="print a table with all numbers, one line an episode")
     output.add_argument("--page", action="store_true", help="list them in a browser on this machine, until Ctrl-C")
-    port = make_number_type(int, "a port: give 0 to 65535", 0, 65535)
-    parser.add_argument("--port", type=port, default=0, metavar="N", help="of the page (default: a free one)")
+    parser.add_argument(
+        "--port", type=parse_free_port, default=0, metavar="N", help="of the page (default: a free one)"
+    )
     parser.add_argument("--no-open", action="store_true", help="of the page: print its address only")
     group = parser.add_argument_group("decisions (of one recording)")
     wanted = {

@@ -17,6 +17,7 @@ from iris_session.cli.common import (
     ending_as_interrupts,
     make_number_type,
     print_result,
+    refuse_options,
     report_damage,
 )
 from iris_session.cli.progress import ProgressLine
@@ -26,6 +27,8 @@ DEFAULT_HZ: Final = 100.0
 #: What `--to` may be: formats of tables, and the other thing that is exported.
 FORMATS: Final = ("csv", "parquet", "npz")
 ASSETS: Final = "assets"
+#: Options that choose tables and their rows.
+_TABLES: Final = ("hz", "robot", "object", "table")
 
 
 def register(actions: Commands) -> None:
@@ -83,12 +86,10 @@ def run_export(arguments: argparse.Namespace) -> int:
 
     require_package("rerun", "reading recordings")
     if arguments.to in DATASETS:
-        given = [f"--{name}" for name in ("hz", "robot", "object", "table", "force") if getattr(arguments, name)]
-        if given:
-            raise CommandError(f"{', '.join(given)} are for tables: leave them out with --to {arguments.to}")
+        refuse_options(arguments, (*_TABLES, "force"), f" are for tables: leave them out with --to {arguments.to}")
         return recording_dataset.run(arguments)
-    if given := recording_dataset.list_given(arguments):
-        raise CommandError(f"{', '.join(given)} are for data sets: leave them out with --to {arguments.to}")
+    why = f" are for data sets: leave them out with --to {arguments.to}"
+    refuse_options(arguments, recording_dataset.OPTIONS, why)
     if len(arguments.paths) > 1:
         raise CommandError(f"--to {arguments.to} takes one recording: give one, or a data set (--to lerobot)")
     arguments.path = arguments.paths[0]
@@ -124,9 +125,7 @@ def _export_assets(arguments: argparse.Namespace) -> int:
     from iris_session.recording.reader import check_assets
     from iris_session.rrd.assets import export_assets
 
-    given = [f"--{name}" for name in ("hz", "robot", "object", "table") if getattr(arguments, name)]
-    if given:
-        raise CommandError(f"{', '.join(given)} choose tables: leave them out with --to {ASSETS}")
+    refuse_options(arguments, _TABLES, f" choose tables: leave them out with --to {ASSETS}")
     with (
         ending_as_interrupts(),
         ProgressLine(arguments.path) as progress,

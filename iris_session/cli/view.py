@@ -21,6 +21,7 @@ from iris_session.cli.common import (
     Commands,
     add_command,
     ending_as_interrupts,
+    make_number_type,
     print_error,
     to_printable,
 )
@@ -77,7 +78,7 @@ def register(commands: Commands) -> None:
     parser.add_argument("--live", action="store_true", help="follow a session that runs, as it is recorded")
     parser.add_argument(
         "--port",
-        type=int,
+        type=make_number_type(int, "a port: give 1 to 65534, or 0 for a free one", 0, 65534),
         default=0,
         metavar="N",
         help="port of the viewer; with --web of the page, which gets its data from port N+1 (default: free ones)",
@@ -89,8 +90,6 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.recording.viewer_export import open_view_file
     from iris_session.rrd.rerun_tool import find_rerun
 
-    if not 0 <= arguments.port < 65535:
-        raise CommandError(f"--port {arguments.port} is not a port: give 1 to 65534")
     taken = [port for port in (arguments.port, arguments.port + 1) if arguments.port and _is_open(port)]
     if taken:  # Rerun would send the recording to a viewer that listens there
         raise CommandError(f"something listens on port {taken[0]} already: give another one, or leave --port out")

@@ -11,6 +11,7 @@ from iris_session.cli.common import (
     add_command,
     add_page_options,
     check_session_reachable,
+    parse_port,
     print_error,
 )
 from iris_session.system.extras import require_package
@@ -41,7 +42,7 @@ def register(commands: Commands) -> None:
         metavar="ADDR",
         help="address to listen on (default: all addresses; 127.0.0.1 if the session is not encrypted)",
     )
-    add_page_options(parser)
+    add_page_options(parser, parse_port)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -60,8 +61,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     if bool(arguments.web_cert) != bool(arguments.web_key):
         raise CommandError("--web-cert and --web-key belong together: give both, or none")
-    if arguments.web_port is not None and not 0 < arguments.web_port < 65536:
-        raise CommandError(f"--web-port {arguments.web_port} is not a port: give 1 to 65535")
     check_session_reachable(arguments)
     request = parse_connect_request(arguments.address, arguments.session, None, arguments.code)
     endpoint = resolve_blocking(request, CONNECT_S)

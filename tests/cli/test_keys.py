@@ -169,7 +169,6 @@ def test_pair_web_has_the_port_of_a_session_that_runs_here(home: KeyHome, capsys
     assert main(["pair", "--no-wait", "--json"]) != 0, "two sessions"
     assert main(["pair", "--no-wait", "--json", "--session", "lab-1"]) == 0
     assert json.loads(capsys.readouterr().out)["page"] == "", "no link to a page that is not served"
-    assert main(["pair", "--web", "--no-wait", "--web-port", "70000"]) != 0
 
 
 def test_pair_unity_writes_what_a_headset_reads_at_start(home: KeyHome, tmp_path: Path, capsys: Capture) -> None:
