@@ -56,15 +56,6 @@ def register(commands: Commands) -> None:
         "anchors",
         help="print anchor sheets, align headsets, calibrate cameras",
         description="Print sheets that headsets and cameras detect, align headsets to them, and calibrate cameras.",
-        examples="""
-            iris-session anchors print --size 150mm --id table --out table.pdf
-            iris-session anchors example > anchors.toml
-            iris-session anchors status --watch
-            iris-session anchors align start ann
-            iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd --out anchors.toml
-            iris-session anchors calibrate-camera pictures --sheet table=150mm --poses poses.csv
-            iris-session anchors calibrate-camera pictures --sheet table=150mm --at table=0,-0.45,0,1,0,0,0
-        """,
     )
     _register_print(actions)
     _register_example(actions)

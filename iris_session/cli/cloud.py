@@ -55,14 +55,6 @@ def register(commands: Commands) -> None:
         help="point clouds of depth cameras: run, example, inspect, calibrate",
         description="Show what depth cameras see as a point cloud in a session. `serve --camera FILE` does so by "
         "itself for cameras at its machine.",
-        examples="""
-            iris-session cloud example -o camera.toml           a commented camera file, to be edited
-            iris-session cloud calibrate camera.toml --out calibration.toml   poses of the cameras, by printed sheets
-            iris-session cloud inspect camera.toml              rate, points, faults, without a session
-            iris-session serve scene.xml --camera camera.toml   the cloud in a session of this machine
-            iris-session cloud run camera.toml --address 192.168.1.20   in a session of another machine
-            iris-session cloud inspect 192.168.1.20             what arrives here, and how old it is
-        """,
     )
     _register_run(actions)
     _register_example(actions)

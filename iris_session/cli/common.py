@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, NoReturn, TypeAlias, TypeVar
 
 from anchors.pose import quat_normalize
 from iris_session.protocol.errors import IrisError
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from iris_session.protocol.server_messages import ParticipantInfo
 
 N = TypeVar("N", int, float)
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+Commands: TypeAlias = "argparse._SubParsersAction[CommandParser]"
 
 #: Bytes of each unit of a size.
 _BYTES: Final = {
@@ -120,6 +120,33 @@ def parse_budget(text: str) -> int:
     return n_bytes
 
 
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose errors are one line, and whose help ends with examples: its own, or the first of each action."""
+
+    notes = ""
+    examples: Sequence[str] = ()
+
+    def list_examples(self) -> Sequence[str]:
+        """Return the examples of its help."""
+        lists = (action.choices.values() for action in self._actions if isinstance(action, argparse._SubParsersAction))
+        return self.examples or [one.list_examples()[0].split("  ")[0] for parsers in lists for one in parsers]
+
+    def format_help(self) -> str:
+        """Return the help."""
+        lines = self.list_examples()
+        title = "examples" if len(lines) > 1 else "example"
+        self.epilog = f"{self.notes}\n\n" * bool(self.notes) + "\n  ".join((f"{title}:", *lines))
+        return super().format_help()
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit with 2; `--help` has the usage."""
+        for action in self._actions:
+            name = action.metavar or action.dest
+            if action.choices and not action.option_strings and message.endswith(f"arguments are required: {name}"):
+                message += f", one of {', '.join(action.choices)}"
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
 def add_command(
     commands: Commands,
     name: str,
@@ -130,7 +157,7 @@ def add_command(
     examples: str,
     notes: str = "",
     has_json: bool = True,
-) -> argparse.ArgumentParser:
+) -> CommandParser:
     """Add a command, or an action of one, and return its parser.
 
     Args:
@@ -143,7 +170,8 @@ def add_command(
         notes: Text before the examples.
         has_json: Add `--json`, which `print_result` obeys.
     """
-    parser = _add_parser(commands, name, help, description, examples, notes)
+    parser = _add_parser(commands, name, help, description)
+    parser.notes, parser.examples = notes, inspect.cleandoc(examples).split("\n")
     parser.set_defaults(run=run)
     if has_json:
         add_json_option(parser)
@@ -151,22 +179,17 @@ def add_command(
 
 
 def add_actions(
-    commands: Commands, name: str, *, help: str, description: str = "", examples: str, metavar: str = "ACTION"
+    commands: Commands, name: str, *, help: str, description: str = "", metavar: str = "ACTION"
 ) -> Commands:
-    """Add a command that has actions, and return them; the arguments are those of `add_command`."""
-    parser = _add_parser(commands, name, help, description, examples, "")
+    """Add a command that has actions, and return them. `help`, `description`: as of `add_command`."""
+    parser = _add_parser(commands, name, help, description)
     return parser.add_subparsers(dest="action", required=True, metavar=metavar)
 
 
-def _add_parser(
-    commands: Commands, name: str, help: str, description: str, examples: str, notes: str
-) -> argparse.ArgumentParser:
-    lines = inspect.cleandoc(examples).split("\n")
-    title = "examples" if len(lines) > 1 else "example"
-    epilog = f"{notes}\n\n" * bool(notes) + "\n  ".join((f"{title}:", *lines))
+def _add_parser(commands: Commands, name: str, help: str, description: str) -> CommandParser:
     form = argparse.RawDescriptionHelpFormatter
     description = description or f"{help[0].upper()}{help[1:]}."
-    return commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=form)
+    return commands.add_parser(name, help=help, description=description, formatter_class=form)
 
 
 def add_json_option(parser: argparse._ActionsContainer) -> None:

@@ -25,13 +25,6 @@ def register(commands: Commands) -> None:
         help="list, allow and revoke the keys that may join",
         description="Manage the keys that may join encrypted sessions of this user, and show the user's own keys. "
         "Running sessions apply changes within half a second: a revoked key is disconnected at once.",
-        examples="""
-            iris-session keys list
-            iris-session keys revoke quest-3
-            iris-session keys allow ann ann.key --role operator    a key received without a join code
-            iris-session keys allow me                             this user, on the server's machine
-            iris-session keys show                                 fingerprints of this user
-        """,
     )
     add_command(actions, "list", run_list, help="list the keys that may join", examples="iris-session keys list --json")
     one = add_command(

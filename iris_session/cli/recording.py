@@ -53,16 +53,6 @@ def register(commands: Commands) -> None:
         help="inspect, view, verify, export, render or repair recordings",
         description="Show what a recording holds, view and verify it, export it as tables, make a film or a picture of "
         "it, or repair it. `iris-session view` and `iris-session verify` are short for the actions of that name.",
-        examples="""
-            iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd
-            iris-session recording inspect sessions
-            iris-session recording episodes sessions --page
-            iris-session recording verify sessions
-            iris-session recording view
-            iris-session recording export session.rrd --to csv -o tables
-            iris-session recording render session.rrd -o session.mp4
-            iris-session recording repair session.rrd -o repaired.rrd
-        """,
     )
     inspect = add_command(
         actions,

@@ -49,12 +49,6 @@ def register(commands: Commands) -> None:
         commands,
         "scene",
         help="inspect what clients receive of a scene, or export it to GLB",
-        examples="""
-            iris-session scene inspect scene.xml
-            iris-session scene inspect arm.urdf
-            iris-session scene inspect part.stl --scale 0.001    (a part in millimetres)
-            iris-session scene export handover handover.glb
-        """,
     )
     inspect = add_command(
         actions,
