@@ -22,6 +22,7 @@ from iris_session.cli.common import (
     add_command,
     add_pose_option,
     find_participant,
+    list_first,
     make_client,
     open_scene,
     parse_length,
@@ -31,7 +32,7 @@ from iris_session.cli.common import (
     write_file,
 )
 from iris_session.cli.status import add_watch_options, run_status_command
-from iris_session.doctor.headset_checks import is_consistent
+from iris_session.doctor.headset_checks import format_age, is_consistent
 from iris_session.protocol.names import AlignAction, AlignmentKind, Role
 
 if TYPE_CHECKING:
@@ -458,29 +459,25 @@ def _format_headset(p: ParticipantReport) -> Iterator[str]:
     stated = aligned and p.alignment != AlignmentKind.PLACED and not r.offset
     at = [f"{m * 1e3:.1f} mm" if stated else "-" for m in (r.error_at_anchor_m, r.error_at_robot_m)]
     yield (
-        f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_duration(p.alignment_age_ns) if aligned else '-':>6s} "
+        f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_age(p.alignment_age_ns) if aligned else '-':>6s} "
         f"{at[0]:>9s} {at[1]:>9s} {r.observations:6d} {r.viewpoints:6d} {degrees(r.residual_tilt_rad):4.1f} deg  "
         f"{format_pending_correction(r)}"
     )
     if r.doubt:
         yield f"    UNCONFIRMED ({r.doubt}): begins no engagement until a look at a sheet"
     if aligned and r.confirmed_ns >= 0:
-        yield f"    confirmed {format_duration(r.confirmed_ns)} ago"
+        yield f"    confirmed {format_age(r.confirmed_ns)} ago"
     if not aligned and p.alignment_void_ns >= 0:
-        yield f"    void for {format_duration(p.alignment_void_ns)}: the tracking frame jumped"
+        yield f"    void for {format_age(p.alignment_void_ns)}: the tracking frame jumped"
     seen = sorted(r.seen, key=lambda one: one.age_ns)
     if seen:
-        sheets = [
-            f"{one.anchor_id} {one.observations} times, {format_duration(one.age_ns)} ago"
-            for one in seen[:MAX_LISTED_SHEETS]
-        ]
-        more = f"; {len(seen) - MAX_LISTED_SHEETS} more" if len(seen) > MAX_LISTED_SHEETS else ""
+        sheets = [f"{one.anchor_id} {one.observations} times, {format_age(one.age_ns)} ago" for one in seen]
         unusable = f"; {r.unusable} unusable" if r.unusable else ""
-        yield f"    saw {'; '.join(sheets)}{more}{unusable}"
+        yield f"    saw {'; '.join(list_first(sheets, MAX_LISTED_SHEETS))}{unusable}"
     elif r.unusable:
         yield f"    observed nothing usable, {r.unusable} times"
     if r.alarm:
-        yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {format_duration(r.alarm_ns)} ago"
+        yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {format_age(r.alarm_ns)} ago"
     if r.advice:
         yield f"    advice: {r.advice}"
 
@@ -500,13 +497,5 @@ def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:
     how = "touched by both" if check.touched else f"{check.n} observations"
     return (
         f"{a} - {b}: {check.error_m * 1e3:.1f} mm{turn} apart at '{check.anchor_id}', "
-        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {how}, {format_duration(check.age_ns)} ago{verdict}"
+        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {how}, {format_age(check.age_ns)} ago{verdict}"
     )
-
-
-def format_duration(duration_ns: int) -> str:
-    """Return a duration as seconds or minutes."""
-    seconds = duration_ns * 1e-9
-    if seconds < 0.0:
-        return "never"
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"

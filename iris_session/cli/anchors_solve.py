@@ -15,6 +15,7 @@ from iris_session.cli.common import (
     CommandError,
     Commands,
     add_command,
+    list_first,
     pick_attributes,
     print_result,
     write_file,
@@ -159,35 +160,22 @@ def _format_frame(person: RecordedParticipant, r: FrameResult) -> Iterator[str]:
         )
     if 2 * r.unused.get("against gravity", 0) > r.looks:
         yield "    most observations contradict gravity: the sheet is not oriented as configured (table or wall?)"
-    yield from _limit_lines(
-        [_format_comparison(one) for one in _select_worst(r.compared)], len(r.compared), "alignments"
-    )
+    worst_first = sorted(r.compared, key=lambda one: -max(one.off_m or 0.0, one.off_end_m or 0.0))
+    compared = [_format_comparison(one) for one in worst_first]
     outliers = [
-        f"    outlier: '{o.anchor_id}' from place {o.viewpoint_id} at {o.at_ns * 1e-9:.1f} s, {o.looks} observations: "
+        f"outlier: '{o.anchor_id}' from place {o.viewpoint_id} at {o.at_ns * 1e-9:.1f} s, {o.looks} observations: "
         f"{_format_mm(o.off_m)}, {math.degrees(o.off_rad):.1f} deg off, "
         f"95 % expected below {_format_mm(o.expected_p95_m)}"
         for o in r.outliers
     ]
-    yield from _limit_lines(outliers[:MAX_LISTED], len(outliers), "outliers")
-
-
-def _select_worst(compared: list[LiveComparison]) -> list[LiveComparison]:
-    """Return the alignments with the largest errors, in order of time."""
-    kept = sorted(compared, key=lambda one: -max(one.off_m or 0.0, one.off_end_m or 0.0))[:MAX_LISTED]
-    return sorted(kept, key=lambda one: one.live.since_ns)
-
-
-def _limit_lines(shown: list[str], of: int, what: str) -> Iterator[str]:
-    yield from shown
-    if of > len(shown):
-        yield f"    ... {of - len(shown)} more {what}, listed by --json"
+    yield from (f"    {line}" for lines in (compared, outliers) for line in list_first(lines, MAX_LISTED))
 
 
 def _format_comparison(one: LiveComparison) -> str:
     a, until = one.live.alignment, one.live.until_ns
     end = "the end" if until < 0 else f"{until * 1e-9:.1f} s"
     kind = a.kind + (" with offset" if a.offset else "")
-    head = f"    version {a.version} ({kind}), {one.live.since_ns * 1e-9:.1f} s to {end}"
+    head = f"version {a.version} ({kind}), {one.live.since_ns * 1e-9:.1f} s to {end}"
     if one.off_m is None or one.off_rad is None:
         return f"{head}: no observations to compare with"
     stated = "no error stated" if one.stated_m is None else f"stated {_format_mm(one.stated_m)}"

@@ -481,11 +481,15 @@ def print_error(text: str) -> None:
     print(to_printable(f"iris-session: {text}"), file=sys.stderr)
 
 
+def name_first(problems: Sequence[str]) -> str:
+    """Return the first problem, and how many more there are."""
+    return problems[0] + (f" (and {len(problems) - 1} more)" if len(problems) > 1 else "")
+
+
 def report_damage(path: Path, problems: Sequence[str]) -> int:
     """Print the first problem of a recording. Return the exit status."""
     if problems:
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        print_error(f"{path} is damaged: {problems[0]}{more}")
+        print_error(f"{path} is damaged: {name_first(problems)}")
     return 1 if problems else 0
 
 

@@ -13,8 +13,7 @@ from iris_session.protocol.names import Role
 from iris_session.security.allow_list import CURVE
 
 if TYPE_CHECKING:
-    from iris_session.security import KeyHome, KeyPair
-    from iris_session.web.certificate import Certificate
+    from iris_session.security import KeyPair
 
 
 def register(commands: Commands) -> None:
@@ -125,9 +124,10 @@ def run_revoke(arguments: argparse.Namespace) -> int:
 def run_show(arguments: argparse.Namespace) -> int:
     """Print the user's own keys, without secrets. Creates none."""
     from iris_session.security import KeyHome
+    from iris_session.web.certificate import find_certificate
 
     home = KeyHome()
-    server, own, page = home.find_server_key(), home.find_identity(), _find_page_certificate(home)
+    server, own, page = home.find_server_key(), home.find_identity(), find_certificate(home)
     certificate = None if page is None else {"fingerprint": page.fingerprint, "key": page.key}
     keys = {"server": _key_to_dict(server), "identity": _key_to_dict(own), "certificate": certificate}
     text = "no certificate yet, created when you serve an encrypted session"
@@ -141,17 +141,6 @@ def run_show(arguments: argparse.Namespace) -> int:
     ]
     print_result(arguments, {"home": str(home.path), **keys}, lines)
     return 0
-
-
-def _find_page_certificate(home: KeyHome) -> Certificate | None:
-    """Return the certificate of the page, `None` where there is none, or nothing to read it with."""
-    from iris_session.system.extras import MissingExtraError
-    from iris_session.web.certificate import find_certificate
-
-    try:
-        return find_certificate(home)
-    except MissingExtraError:
-        return None
 
 
 def _key_to_dict(pair: KeyPair | None) -> dict[str, str] | None:

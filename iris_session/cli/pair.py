@@ -191,17 +191,11 @@ def _write_pairing_file(
 
 def _find_certificate(arguments: argparse.Namespace, home: KeyHome, hosts: list[str]) -> Certificate | None:
     """Return the certificate of the page: the code works there too. Made where `--web` or `--unity` needs it."""
-    from iris_session.system.extras import MissingExtraError
     from iris_session.web.certificate import find_certificate, load_certificate, load_or_make_certificate
 
     if arguments.web_cert:
         return load_certificate(arguments.web_cert)
-    try:
-        return load_or_make_certificate(home, hosts) if _needs_web(arguments) else find_certificate(home)
-    except MissingExtraError:
-        if _needs_web(arguments):
-            raise
-        return None  # no page, no certificate
+    return load_or_make_certificate(home, hosts) if _needs_web(arguments) else find_certificate(home)
 
 
 def _find_addresses(

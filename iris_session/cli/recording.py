@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 from iris_session.cli import recording_episodes, recording_export, recording_render, view
 from iris_session.cli.common import (
-    MOST_LINES,
     CommandError,
     Commands,
     add_actions,
@@ -94,12 +93,9 @@ def register(commands: Commands) -> None:
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print the summary of a recording, or a line for each of a folder."""
-    from iris_session.system.extras import require_package
-
     path: Path = arguments.path
     if not os.path.exists(path):
         raise CommandError(f"{path} does not exist: give a recording (session{SUFFIX}), or a folder with recordings")
-    require_package("rerun", "reading recordings")
     with ending_as_interrupts():
         if path.is_dir():
             return _inspect_folder(path, as_json=arguments.json)
@@ -315,8 +311,7 @@ def _count(n: int, noun: str) -> str:
 
 
 def _join(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:MOST_LINES]) or "none"
-    return f"{shown} and {len(names) - MOST_LINES} more" if len(names) > MOST_LINES else shown
+    return ", ".join(list_first(names)) or "none"
 
 
 # --- repair -----------------------------------------------------------------------------------------------------------
@@ -377,9 +372,6 @@ def _register_verify(commands: Commands) -> None:
 def run_verify(arguments: argparse.Namespace) -> int:
     """Verify each file; the first problem of each is named with its step and entry."""
     from iris_session.recording import Problem, RecordingError, VerifyReport
-    from iris_session.system.extras import require_package
-
-    require_package("rerun", "verifying recordings")
     from iris_session.session.verification import verify_recording
 
     reports: list[VerifyReport] = []

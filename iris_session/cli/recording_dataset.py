@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from contextlib import redirect_stdout
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import MOST_LINES, CommandError, ending_as_interrupts, make_number_type, print_result
+from iris_session.cli.common import CommandError, ending_as_interrupts, list_first, make_number_type, print_result
 from iris_session.cli.progress import ProgressLine
 from iris_session.cli.recording_render import parse_size
 from iris_session.dataset.formats import FORMATS
@@ -109,9 +108,4 @@ def run(arguments: argparse.Namespace) -> int:
 def _format(report: DatasetReport) -> list[str]:
     n = f"{report.episodes:,} episode{'' if report.episodes == 1 else 's'}"
     lines = [f"{report.folder}: {n}, {report.frames:,} frames, {report.format}"]
-    return [*lines, *_first(report.left_out), *_first(report.notes)]
-
-
-def _first(lines: Sequence[str]) -> list[str]:
-    more = len(lines) - MOST_LINES
-    return [*(f"  {line}" for line in lines[:MOST_LINES]), *([f"  and {more} more"] if more > 0 else [])]
+    return [*lines, *(f"  {line}" for line in (*list_first(report.left_out), *list_first(report.notes)))]

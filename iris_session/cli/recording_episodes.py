@@ -88,7 +88,6 @@ def run(arguments: argparse.Namespace) -> int:
     """List the episodes, write decisions, or serve the page."""
     from iris_session.system.extras import require_package
 
-    require_package("rerun", "reading recordings")
     if arguments.page:
         require_package("aiohttp", "--page")
         require_package("PIL", "--page")

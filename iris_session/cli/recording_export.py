@@ -10,11 +10,11 @@ from typing import Final
 from iris_session.cli import recording_dataset
 from iris_session.cli.common import (
     ABOVE_0,
-    MOST_LINES,
     CommandError,
     Commands,
     add_command,
     ending_as_interrupts,
+    list_first,
     make_number_type,
     print_result,
     refuse_options,
@@ -82,9 +82,6 @@ def register(actions: Commands) -> None:
 
 def run_export(arguments: argparse.Namespace) -> int:
     """Write a data set; or the tables, and print a line for each; or the assets."""
-    from iris_session.system.extras import require_package
-
-    require_package("rerun", "reading recordings")
     if arguments.to in DATASETS:
         refuse_options(arguments, (*_TABLES, "force"), f" are for tables: leave them out with --to {arguments.to}")
         return recording_dataset.run(arguments)
@@ -144,6 +141,6 @@ def _export_assets(arguments: argparse.Namespace) -> int:
         damage = (*recording.missing, *recording.damage, *report.damage)
         report = msgspec.structs.replace(report, damage=damage)
     size = f"{report.assets:,} assets, {report.bytes / 1e6:.1f} MB, scenes: {report.scenes:,}"
-    missing = (f"  not recorded: {line}" for line in report.left_out[:MOST_LINES])
+    missing = (f"  not recorded: {line}" for line in list_first(report.left_out))
     print_result(arguments, report, [f"{report.folder}: {size}", *missing])
     return report_damage(arguments.path, report.damage)

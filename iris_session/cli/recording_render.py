@@ -104,7 +104,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Draw the pictures, and print what was written."""
     from iris_session.system.extras import require_package
 
-    require_package("rerun", "reading recordings")
     require_package("cv2", "writing pictures")
     from iris_session.recording import Recording
     from iris_session.replay.pictures import PictureOptions, RecordingPictures, Timeline, list_cameras

@@ -22,6 +22,7 @@ from iris_session.cli.common import (
     add_command,
     ending_as_interrupts,
     make_number_type,
+    name_first,
     print_error,
     to_printable,
 )
@@ -164,8 +165,7 @@ def _print_file(view: ViewFile) -> None:
         lines.append(f"{'made' if view.made else 'uses'} the copy {view.path} ({size:.1f} MB)")
     lines += view.notes
     if view.damage:
-        more = f" (and {len(view.damage) - 1} more)" if len(view.damage) > 1 else ""
-        lines.append(f"DAMAGED: {view.damage[0]}{more}; see `iris-session recording inspect`")
+        lines.append(f"DAMAGED: {name_first(view.damage)}; see `iris-session recording inspect`")
     print("\n".join(map(to_printable, lines)), flush=True)
 
 

@@ -154,12 +154,12 @@ REPORT = StatusReport(
 def test_screen_shows_basis_of_every_alignment() -> None:
     text = "\n".join(format_alignment_status(REPORT))
     ann = next(line for line in text.split("\n") if "ann" in line)
-    assert " ".join(ann.split()).endswith("(p1) measured 7 61 s 2.1 mm 4.4 mm 210 3 0.2 deg -")
+    assert " ".join(ann.split()).endswith("(p1) measured 7 61.0 s 2.1 mm 4.4 mm 210 3 0.2 deg -")
     for value in ("door 90 times", "table 120 times", "2 unusable"):
         assert value in text
     assert "none STOPPED" in text
     assert "12.0 mm, 0.00 deg" in text
-    assert "void for 4 s" in text
+    assert "void for 4.0 s" in text
     assert "ALARM jump" in text
     assert "advice: step closer" in text
     assert "0.0000, -0.4500, 0.0000 m, rotation 1,0,0,0, 160 mm" in text

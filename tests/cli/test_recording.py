@@ -12,7 +12,8 @@ import msgspec
 import pytest
 
 from iris_session.cli.main import INTERRUPTED, main
-from iris_session.cli.recording import MOST_LINES, format_line, format_summary
+from iris_session.cli.common import MOST_LINES
+from iris_session.cli.recording import format_line, format_summary
 from iris_session.protocol.server_messages import EpisodeChanged, Event
 from iris_session.recording import Recording, parts
 from iris_session.recording.folders import find_recordings
