@@ -85,9 +85,7 @@ def _register_print(actions: Commands) -> None:
             iris-session anchors print --id table --measured 149.2mm
         """,
     )
-    one.add_argument(
-        "--size", type=parse_length, metavar="LENGTH", help="edge of the QR code (150mm; with --marks 140mm)"
-    )
+    one.add_argument("--size", type=parse_length, metavar="LENGTH", help="edge of the QR code (150mm; --marks: 140mm)")
     one.add_argument("--marks", action="store_true", help="four crosses around the frame; a4 holds sizes up to 142mm")
     one.add_argument(
         "--measured",
@@ -115,12 +113,7 @@ def _register_example(actions: Commands) -> None:
             iris-session anchors example --marks > anchors.toml
         """,
     )
-    one.add_argument(
-        "scene",
-        nargs="?",
-        default="",
-        help="name of a scene (see `iris-session serve --help`); default: one sheet, `table`",
-    )
+    one.add_argument("scene", nargs="?", default="", help="a scene of `serve --help` (default: one sheet, `table`)")
     one.add_argument("--marks", action="store_true", help="of sheets with marks, as `print --marks` writes them")
     _add_layout_option(one)
 

@@ -49,12 +49,8 @@ def register(actions: Commands) -> None:
             iris-session anchors solve session.rrd --out anchors.toml
         """,
     )
-    one.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="a .rrd file; later parts are found by their names"
-    )
-    one.add_argument(
-        "--anchors", type=Path, metavar="TOML", help="true poses of the anchors (default: those of the session)"
-    )
+    one.add_argument("recording", type=Path, metavar="RECORDING", help="a .rrd file; its later parts are found, too")
+    one.add_argument("--anchors", type=Path, metavar="TOML", help="true poses of anchors (default: the session's)")
     one.add_argument("--out", type=Path, metavar="FILE", help="write the poses of the sheets, for `serve --anchors`")
 
 

@@ -363,9 +363,7 @@ def register_depth_cameras(actions: Commands) -> None:
     _add_sheet_options(parser, is_required=False, at=at)
     add_address_options(parser, option=True)
     count = make_number_type(int, "a number of frames: give 1 to 200, for example 10", 1, 200)
-    parser.add_argument(
-        "--frames", type=count, default=10, metavar="N", help="frames per camera (default: %(default)s)"
-    )
+    parser.add_argument("--frames", type=count, default=10, metavar="N", help="frames per camera (%(default)s)")
     parser.add_argument("--icp", action="store_true", help="then fit several cameras to each other")
     parser.add_argument("--check", action="store_true", help="tell whether the poses of the camera file still fit")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the result as TOML, for the camera file")

@@ -97,9 +97,7 @@ def _register_example(actions: Commands) -> None:
             iris-session cloud example --source realsense -o camera.toml
         """,
     )
-    parser.add_argument(
-        "--source", choices=sorted(SOURCES), default="folder", help="what the frames come from (default: %(default)s)"
-    )
+    parser.add_argument("--source", choices=sorted(SOURCES), default="folder", help="source of frames (%(default)s)")
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write it to a file that does not exist yet")
 
 

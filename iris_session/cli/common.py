@@ -10,7 +10,6 @@ import re
 import signal
 import socket
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -223,22 +222,14 @@ def check_session_reachable(arguments: argparse.Namespace) -> None:
 
     A client would wait for the session to start. A session given by name is not checked: it has no address yet.
     """
-    from iris_session.client.discovery import Address, resolve_host
+    from iris_session.client.discovery import Address
     from iris_session.client.endpoint_resolver import LOCAL_ADDRESS
 
     if arguments.session:
         return
     address = Address.parse(arguments.address or LOCAL_ADDRESS)
-    until_s = time.monotonic() + CONNECT_S
-    resolving = resolve_host(address.host, until_s)
     try:
-        while True:
-            try:
-                next(resolving)
-            except StopIteration as found:
-                socket.create_connection((found.value, address.port), max(0.1, until_s - time.monotonic())).close()
-                return
-            time.sleep(0.005)
+        socket.create_connection((address.host, address.port), CONNECT_S).close()
     except OSError as error:
         raise CommandError(
             f"no session answers at {address}: is `iris-session serve` running there? "
@@ -323,9 +314,7 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
         metavar="NAME_OR_ADDR",
         help="network to listen on instead of --host: a name like eth0, or an address; repeatable",
     )
-    group.add_argument(
-        "--advertise", metavar="ADDR", help="address announced to clients, behind a router that forwards ports"
-    )
+    group.add_argument("--advertise", metavar="ADDR", help="address for clients, if a router forwards our ports")
     group.add_argument(
         "--port-base",
         type=parse_port_base,
@@ -418,9 +407,7 @@ def parse_sites(text: str) -> bool | tuple[int, ...]:
 def add_page_options(group: argparse._ActionsContainer, port: Callable[[str], int]) -> None:
     """Add the options of the page for browsers, for `serve`, `demo` and `web`. `port`: type of its port."""
     group.add_argument("--web-port", type=port, metavar="PORT", help="port of the page for browsers (default: 7725)")
-    group.add_argument(
-        "--web-cert", default="", metavar="FILE", help="certificate for HTTPS, PEM (default: one of this user's own)"
-    )
+    group.add_argument("--web-cert", default="", metavar="FILE", help="certificate for HTTPS, PEM (default: your own)")
     group.add_argument("--web-key", default="", metavar="FILE", help="key of that certificate, PEM")
 
 

@@ -69,24 +69,12 @@ def register(commands: Commands) -> None:
         metavar="N",
         help="handovers; with several the object lies a little elsewhere in each (default: 1)",
     )
-    parser.add_argument(
-        "--operators", type=int, default=2, metavar="N", help="operators, in pairs; 2 to 8 (default: 2)"
-    )
+    parser.add_argument("--operators", type=int, default=2, metavar="N", help="operators in pairs, 2 to 8 (default: 2)")
     parser.add_argument("--observers", type=int, default=0, metavar="N", help="observers; 0 to 16 (default: 0)")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the emulated operators")
-    parser.add_argument(
-        "--timeout",
-        type=parse_seconds,
-        metavar="S",
-        help="stop after this many seconds (default: 150, and 60 for each further episode)",
-    )
+    parser.add_argument("--timeout", type=parse_seconds, metavar="S", help="at most so long (150, 60 more per episode)")
     link = parser.add_mutually_exclusive_group()
-    link.add_argument(
-        "--profile",
-        default="",
-        metavar="NAME",
-        help="link profile of every operator (docs/evidence/links.md), e.g. busy-wifi",
-    )
+    link.add_argument("--profile", default="", metavar="NAME", help="link of every operator (docs/evidence/links.md)")
     link.add_argument(
         "--latency",
         type=make_number_type(float, "a delay: give 0 to 10000 milliseconds, for example 40", 0.0, 10_000.0),

@@ -36,9 +36,7 @@ def register(commands: Commands) -> None:
         """,
     )
     add_address_options(parser, code="a join code to try; it is used up")
-    parser.add_argument(
-        "--role", choices=sorted(Role.ALL), default=Role.OBSERVER, help="role to try (default: %(default)s)"
-    )
+    parser.add_argument("--role", choices=sorted(Role.ALL), default=Role.OBSERVER, help="role to try (%(default)s)")
     parser.add_argument("--server", action="store_true", help="check this machine as a server")
     parser.add_argument("--identity", default="", metavar="DIR", help="folder of keys (default: as for every command)")
     parser.add_argument(

@@ -63,15 +63,14 @@ def register(commands: Commands) -> None:
     )
     parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key (*.key)")
     parser.add_argument("--curve-key", default="", metavar="FILE", help="CURVE secret key of the client (*.key_secret)")
-    parser.add_argument(
-        "--orders", action="store_true", help="read orders from standard input: bump, recentre, drift or steady NAME"
-    )
+    parser.add_argument("--orders", action="store_true", help="read lines: bump, recentre, drift or steady NAME")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
+    parser.set_defaults(specs="")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the emulated headsets in this process. Exit status 0 if none failed."""
-    from iris_session.emulator.__main__ import main
+    from iris_session.emulator.__main__ import run as run_headsets
 
     if arguments.headset and (arguments.drift is not None or arguments.bump_at or arguments.glance_every):
         raise CommandError(
@@ -83,20 +82,12 @@ def run(arguments: argparse.Namespace) -> int:
         common += ",bump_at_s=" + "/".join(map(str, arguments.bump_at))
     if arguments.drift is not None:
         common += f",model.drift_m_per_min={arguments.drift / 1000.0}"
-    headsets = arguments.headset or [
+    arguments.headset = arguments.headset or [
         f"name={arguments.behaviour}{i + 1}-{os.getpid()},behaviour={arguments.behaviour},robot={arguments.robot},"
         f"seed={arguments.seed + i}{common}"
         for i in range(arguments.count)
     ]
-    options = ["--address", arguments.address, "--session", arguments.session, "--code", arguments.code]
-    options += ["--join-timeout", str(arguments.join_timeout)]
-    options += ["--curve-server", arguments.curve_server, "--curve-key", arguments.curve_key]
-    for headset in headsets:
-        options += ["--headset", headset]
-    if arguments.seconds is not None:
-        options += ["--seconds", str(arguments.seconds)]
-    options += [flag for flag, given in (("--json", arguments.json), ("--orders", arguments.orders)) if given]
-    status = main(options, "iris-session")
+    status = run_headsets(arguments, "iris-session")
     if status == 1:
         try:  # only now, for a better message: the session may have started meanwhile
             check_session_reachable(arguments)

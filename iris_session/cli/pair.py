@@ -67,15 +67,9 @@ def register(commands: Commands) -> None:
     minutes = make_number_type(float, wanted, ABOVE_0, MAX_MINUTES)
     parser.add_argument("--minutes", type=minutes, default=10.0, metavar="M", help="validity in minutes (10)")
     parser.add_argument("--name", default="", help="name of the device in the list (default: as the device sends it)")
-    parser.add_argument(
-        "--session", default="", metavar="NAME", help="name of the session, if several run on this machine"
-    )
-    parser.add_argument(
-        "--address", default="", metavar="HOST[:PORT]", help="address at which others reach the session"
-    )
-    parser.add_argument(
-        "--curve-key", default="", metavar="FILE", help="secret key of the session (default: the user's)"
-    )
+    parser.add_argument("--session", default="", metavar="NAME", help="which session, if several run on this machine")
+    parser.add_argument("--address", default="", metavar="HOST[:PORT]", help="where others reach the session")
+    parser.add_argument("--curve-key", default="", metavar="FILE", help="secret key of the session (default: yours)")
     parser.add_argument("--web", action="store_true", help="show a link to the page for browsers as the QR code")
     parser.add_argument(
         "--unity",
@@ -84,16 +78,9 @@ def register(commands: Commands) -> None:
         help="write addresses, key of the certificate and code as JSON, which the headset apps read at start; secret "
         "until the code is used",
     )
-    parser.add_argument(
-        "--web-port",
-        type=parse_port,
-        metavar="PORT",
-        help="port of the page (default: as the session has said, or by --address)",
-    )
+    parser.add_argument("--web-port", type=parse_port, metavar="PORT", help="port of the page (default: it is found)")
     parser.add_argument("--png", type=Path, metavar="FILE", help="also write the QR code as an image")
-    parser.add_argument(
-        "--web-cert", default="", metavar="FILE", help="certificate of the page (default: this user's own)"
-    )
+    parser.add_argument("--web-cert", default="", metavar="FILE", help="certificate of the page (default: yours)")
     parser.add_argument("--no-wait", action="store_true", help="do not wait until the code is used")
 
 

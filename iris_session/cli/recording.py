@@ -364,9 +364,7 @@ def _register_verify(commands: Commands) -> None:
             iris-session verify sessions             every recording in a folder and below it
         """,
     )
-    parser.add_argument(
-        "files", nargs="+", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it"
-    )
+    parser.add_argument("files", nargs="+", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings")
 
 
 def run_verify(arguments: argparse.Namespace) -> int:

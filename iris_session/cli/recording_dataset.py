@@ -46,9 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--plain", action="store_true", help="pictures without shadows: faster without a graphics card")
     group.add_argument("--depth", action="store_true", help="depth of every picture too (robomimic, mcap)")
     group.add_argument("--masks", action="store_true", help="the body of every pixel too (robomimic, mcap)")
-    group.add_argument(
-        "--labels", metavar="LIST", help=f"episodes to export, of {', '.join(LABELS)} (default: success)"
-    )
+    group.add_argument("--labels", metavar="LIST", help=f"episodes, of {', '.join(LABELS)} (default: success)")
     group.add_argument("--task", metavar="TEXT", help="what was to be done, for all episodes")
     group.add_argument("--anonymise", action="store_true", help="p1, p2, ... in place of the names of people")
     jobs = make_number_type(int, "a number of processes: give 1 or more", 1, 1024)

@@ -56,20 +56,14 @@ def register(actions: Commands) -> None:
         """,
     )
     parser.add_argument("paths", type=Path, nargs="+", metavar="RECORDING", help="recordings, and folders with some")
-    parser.add_argument(
-        "--cameras",
-        metavar="LIST",
-        help="drawn cameras as for `export`: share of time with a gripper out of each picture",
-    )
+    parser.add_argument("--cameras", metavar="LIST", help="as of `export`: share of time with a gripper out of view")
     parser.add_argument("--size", type=parse_size, metavar="WxH", help="of their pictures (default: 640x480)")
     parser.add_argument("--verify", action="store_true", help="simulate every recording again, and mark what differs")
     output = parser.add_mutually_exclusive_group()
     add_json_option(output)
     output.add_argument("--csv", action="store_true", help="print a table with all numbers, one line an episode")
     output.add_argument("--page", action="store_true", help="list them in a browser on this machine, until Ctrl-C")
-    parser.add_argument(
-        "--port", type=parse_free_port, default=0, metavar="N", help="of the page (default: a free one)"
-    )
+    parser.add_argument("--port", type=parse_free_port, default=0, metavar="N", help="of the page (default: any)")
     parser.add_argument("--no-open", action="store_true", help="of the page: print its address only")
     group = parser.add_argument_group("decisions (of one recording)")
     wanted = {

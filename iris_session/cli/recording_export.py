@@ -56,7 +56,7 @@ def register(actions: Commands) -> None:
         """,
     )
     parser.add_argument(
-        "paths", type=Path, nargs="+", metavar="RECORDING", help="a .rrd or a folder; for a data set: any number"
+        "paths", type=Path, nargs="+", metavar="RECORDING", help="a .rrd or a folder; a data set: several"
     )
     formats = (*DATASETS, *FORMATS, ASSETS)
     parser.add_argument("--to", required=True, choices=formats, help="format of the data set or tables, or assets")

@@ -62,24 +62,14 @@ def register(actions: Commands) -> None:
     )
     parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="the file to write: .mp4, .gif or .png")
-    parser.add_argument(
-        "--camera", default="", metavar="NAME", help="camera of the model (default: a view of all bodies that move)"
-    )
+    parser.add_argument("--camera", default="", metavar="NAME", help="camera of the model (default: all that moves)")
     parser.add_argument("--list-cameras", action="store_true", help="print the cameras of the scene, and draw nothing")
-    parser.add_argument(
-        "--size", type=parse_size, default=DEFAULT_SIZE, metavar="WxH", help="pixels (default: 960x540)"
-    )
-    parser.add_argument(
-        "--fps", type=parse_rate, default=DEFAULT_FPS, metavar="N", help="pictures per second (default: 30)"
-    )
-    parser.add_argument(
-        "--speed", type=parse_rate, default=1.0, metavar="N", help="times as fast as it was (default: 1)"
-    )
+    parser.add_argument("--size", type=parse_size, default=DEFAULT_SIZE, metavar="WxH", help="pixels (960x540)")
+    parser.add_argument("--fps", type=parse_rate, default=DEFAULT_FPS, metavar="N", help="pictures per second (30)")
+    parser.add_argument("--speed", type=parse_rate, default=1.0, metavar="N", help="times as fast as it was (1)")
     parser.add_argument("--from", dest="begin", type=parse_time, metavar="S", help="session time to begin at [s]")
     parser.add_argument("--to", dest="end", type=parse_time, metavar="S", help="session time to end at [s]")
-    parser.add_argument(
-        "--at", type=parse_time, metavar="S", help="session time of a .png [s] (default: the middle of the recording)"
-    )
+    parser.add_argument("--at", type=parse_time, metavar="S", help="session time of a .png [s] (default: the middle)")
     parser.add_argument("--people", action="store_true", help="draw heads and hands too, in their colours in `view`")
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
 

@@ -121,9 +121,7 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         "scene (see `iris-session serve --help`)",
     )
     add_file_options(parser)
-    parser.add_argument(
-        "--assets", default=None, metavar="DIR", help="folder of assets (default: ~/.cache/iris-session/assets)"
-    )
+    parser.add_argument("--assets", metavar="DIR", help="folder of assets (default: ~/.cache/iris-session/assets)")
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:

@@ -104,12 +104,7 @@ def register(commands: Commands) -> None:
         metavar="TOML",
         help="depth cameras to show as a point cloud, repeatable; see `iris-session cloud example`",
     )
-    parser.add_argument(
-        "--task",
-        type=Path,
-        metavar="TOML",
-        help="task whose episodes are recorded; its progress is kept beside the file",
-    )
+    parser.add_argument("--task", type=Path, metavar="TOML", help="task of the episodes; progress is kept beside it")
     parser.add_argument(
         "--picture",
         dest="pictures",

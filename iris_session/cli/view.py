@@ -73,9 +73,7 @@ def register(commands: Commands) -> None:
         help="a .rrd of a session, or a folder: the newest session in or below it (default: the folder sessions)",
     )
     parser.add_argument("--web", action="store_true", help="in a browser; the default where there is no display")
-    parser.add_argument(
-        "--no-open", action="store_true", help="open no window: only make the copy, or with --web serve the page"
-    )
+    parser.add_argument("--no-open", action="store_true", help="only make the copy, or with --web serve the page")
     parser.add_argument("--live", action="store_true", help="follow a session that runs, as it is recorded")
     parser.add_argument(
         "--port",

@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from iris_session.cli.main import INTERRUPTED, main
 from iris_session.cli.common import MOST_LINES
+from iris_session.cli.main import INTERRUPTED, main
 from iris_session.cli.recording import format_line, format_summary
 from iris_session.protocol.server_messages import EpisodeChanged, Event
 from iris_session.recording import Recording, parts
