@@ -43,11 +43,7 @@ if TYPE_CHECKING:
 
 #: Edge of the code with marks where none is given: it must be smaller than the default sheet to fit on A4.
 MARKED_SHEET_M: Final = 0.140
-#: A printed sheet that is further off its size is no print of that sheet at 100 %.
-MAX_MISPRINT: Final = 0.05
 ALL_PARTICIPANTS: Final = "all"
-#: Sheets listed per headset, most recently observed first.
-MAX_LISTED_SHEETS: Final = 8
 
 
 def register(commands: Commands) -> None:
@@ -253,7 +249,7 @@ def run_print(arguments: argparse.Namespace) -> int:
 def _print_measured(arguments: argparse.Namespace, sheet: Sheet, size_m: float) -> int:
     """Print the lines of the anchors file for a sheet as it was measured. Raises `CommandError` for a misprint."""
     scale = sheet.edge_m / size_m - 1.0
-    if abs(scale) > MAX_MISPRINT:
+    if abs(scale) > 0.05:  # it is no print of that sheet at 100 %
         raise CommandError(
             f"{1e3 * sheet.edge_m:g} mm is {scale:+.1%} off {1e3 * size_m:g} mm: print at 100 % again, or give the "
             "size that it was printed for by --size"
@@ -368,11 +364,7 @@ def explain_unaffected_alignment(p: ParticipantReport, anchor: str) -> str:
 
 
 def select_participants(client: Client, name: str) -> list[ParticipantInfo]:
-    """Return the participant with an id or name, or all with a headset for `all`.
-
-    Raises:
-        CommandError: There is none, or several have the name.
-    """
+    """Return the participant with an id or name, or all with a headset for `all`. Raises `CommandError`."""
     people = list(client.mirror.participants.values())
     if name != ALL_PARTICIPANTS or any(name in (one.id, one.name) for one in people):
         return [find_participant(client, name)]
@@ -466,7 +458,7 @@ def _format_headset(p: ParticipantReport) -> Iterator[str]:
     if seen:
         sheets = [f"{one.anchor_id} {one.observations} times, {format_age(one.age_ns)} ago" for one in seen]
         unusable = f"; {r.unusable} unusable" if r.unusable else ""
-        yield f"    saw {'; '.join(list_first(sheets, MAX_LISTED_SHEETS))}{unusable}"
+        yield f"    saw {'; '.join(list_first(sheets, most=8))}{unusable}"
     elif r.unusable:
         yield f"    observed nothing usable, {r.unusable} times"
     if r.alarm:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from anchors.pose import pose_to_dict
 from iris_session.cli.common import (
@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from anchors.pose import PoseTuple
     from iris_session.alignment.resolve import FrameResult, LiveComparison, RelativePoses
     from iris_session.recording import AlignmentHistory, RecordedParticipant, Recording
-
-#: Printed alignments and outliers per tracking frame; `--json` has all.
-MAX_LISTED: Final = 12
 
 
 def register(actions: Commands) -> None:
@@ -164,7 +161,7 @@ def _format_frame(person: RecordedParticipant, r: FrameResult) -> Iterator[str]:
         f"95 % expected below {_format_mm(o.expected_p95_m)}"
         for o in r.outliers
     ]
-    yield from (f"    {line}" for lines in (compared, outliers) for line in list_first(lines, MAX_LISTED))
+    yield from (f"    {line}" for lines in (compared, outliers) for line in list_first(lines, most=12))
 
 
 def _format_comparison(one: LiveComparison) -> str:

@@ -53,12 +53,6 @@ PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 COLUMNS: Final = "image,x,y,z,qw,qx,qy,qz"
 #: Time for a camera to give its frames [s].
 FRAMES_S: Final = 20.0
-#: Time for the session to name its anchors [s].
-ANCHORS_S: Final = 5.0
-#: Edge of the cells that ICP compares [m]: normals of smaller ones are noise.
-_ICP_VOXEL_M: Final = 0.02
-#: Error of a calibration that states none, 95 % [mm].
-_UNKNOWN_ERROR_MM: Final = 20.0
 
 
 # --- options of both --------------------------------------------------------------------------------------------------
@@ -206,12 +200,7 @@ def run_camera(arguments: argparse.Namespace) -> int:
 
 
 def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Calibrate cameras from pictures. Return the object that `--json` prints.
-
-    Raises:
-        CommandError: The options or files are unusable.
-        CalibrationError: The pictures do not determine a result.
-    """
+    """Calibrate cameras from pictures. Return the object that `--json` prints. Raises `CalibrationError`."""
     sheets = make_sheets(arguments.sheet)
     _check_options(arguments, sheets)
     if arguments.at:
@@ -421,7 +410,7 @@ def _print_check(arguments: argparse.Namespace, settings: CloudSettings, placed:
     cameras: dict[str, dict[str, Any]] = {}
     for camera in settings.cameras:
         assert camera.pose is not None  # the camera file was checked
-        error_mm = _UNKNOWN_ERROR_MM if camera.error_mm is None else camera.error_mm
+        error_mm = 20.0 if camera.error_mm is None else camera.error_mm  # 95 %
         one = check_pose(camera.pose.to_matrix(), 1e-3 * error_mm, placed[camera.name])
         cameras[camera.name] = {
             "fits": one.fits,
@@ -453,7 +442,7 @@ def _find_known_sheets(arguments: argparse.Namespace) -> KnownSheets:
 def _ask_session(arguments: argparse.Namespace, sheets: list[Sheet]) -> KnownSheets:
     """Join as an observer for the poses and sizes of the anchors. `sheets`: further ones, at unknown poses."""
     with make_client(arguments, "observer", "cloud calibrate") as client:
-        client.wait_for(lambda one: one.mirror.synced, ANCHORS_S)
+        client.wait_for(lambda one: one.mirror.synced, 5.0)
         anchors = [one for one in client.mirror.anchors.values() if one.size_m > 0.0]
     if not anchors:
         raise CommandError(
@@ -494,14 +483,9 @@ def _take_frames(camera: CameraSettings, n: int) -> CameraFrames:
 def calibrate(
     settings: CloudSettings, taken: list[CameraFrames], known: KnownSheets, *, icp: bool = False
 ) -> tuple[dict[str, Any], dict[str, PlacedCamera]]:
-    """Solve the poses of cameras by the sheets in their frames.
+    """Solve the poses of cameras by the sheets in their frames. Raises `CalibrationError`.
 
-    Returns:
-        The object that `--json` prints, and the cameras by name, before ICP.
-
-    Raises:
-        CommandError: The frames are not of the size of the intrinsics.
-        CalibrationError: The frames do not determine the poses.
+    Return the object that `--json` prints, and the cameras by name, before ICP.
     """
     from anchors.camera import pose_to_matrix
     from anchors.depth_calibration import PlacedCamera, compute_points_error
@@ -544,7 +528,7 @@ def _make_points(settings: CloudSettings, one: CameraFrames, T_world_camera: Flo
     from iris_session.cloud.pipeline import make_limits
     from iris_session.cloud.voxels import MIN_AROUND, MIN_POINTS, VoxelFilter, make_rays
 
-    voxels = VoxelFilter(_ICP_VOXEL_M)
+    voxels = VoxelFilter(0.02)  # ICP compares their normals; those of smaller cells are noise
     limits = make_limits(settings, one.settings)
     rays = make_rays(one.camera)
     for frame in one.frames:

@@ -38,10 +38,6 @@ if TYPE_CHECKING:
     from iris_session.cloud.config import CameraReport
     from iris_session.cloud.worker import CloudWorker
 
-#: Time for a camera to warm up before `inspect` measures, at most [s].
-FIRST_FRAME_S: Final = 10.0
-#: Time for the session to tell us its streams [s].
-STREAMS_S: Final = 5.0
 #: Without a terminal, a line of `run` that is like the one before is printed this often [s].
 QUIET_S: Final = 10.0
 log = logging.getLogger(__name__)
@@ -290,7 +286,7 @@ def _inspect_file(arguments: argparse.Namespace, path: Path) -> int:
         worker = CloudWorker(settings, _NoSink(), open_source, time.perf_counter_ns)
         worker.start()
         try:
-            _run_worker(worker, FIRST_FRAME_S, lambda: worker.cloud is not None)
+            _run_worker(worker, 10.0, lambda: worker.cloud is not None)  # a camera warms up
             worker.make_report()  # its rates begin here
             _run_worker(worker, arguments.seconds, lambda: False)
             report = worker.make_report()
@@ -347,7 +343,7 @@ def _inspect_session(arguments: argparse.Namespace) -> int:
             budget = client.media.delivery
             return [] if budget is None else [one.stream for one in budget.streams if one.encoding in shown]
 
-        client.wait_for(lambda _: bool(list_streams()), STREAMS_S)
+        client.wait_for(lambda _: bool(list_streams()), 5.0)
         meters = [StreamMeter(client, stream, time.monotonic_ns()) for stream in list_streams()]
         until = time.monotonic() + arguments.seconds
         while meters and time.monotonic() < until:

@@ -33,12 +33,9 @@ Commands: TypeAlias = "argparse._SubParsersAction[CommandParser]"
 _BYTES: Final = {
     f"{letter}{i}b": base**n for n, letter in enumerate("kmgt", 1) for i, base in (("", 1000), ("i", 1024))
 }
-#: The least number above 0.
 ABOVE_0: Final = math.ulp(0.0)
 #: Lines of one kind that are printed; `--json` has all.
 MOST_LINES: Final = 20
-#: Timeout of the test whether a session is reachable [s].
-CONNECT_S: Final = 2.0
 
 
 class CommandError(IrisError):
@@ -69,14 +66,7 @@ def ending_as_interrupts() -> Iterator[None]:
 
 
 def make_number_type(kind: Callable[[str], N], wanted: str, low: float, high: float = math.inf) -> Callable[[str], N]:
-    """Return a type for `add_argument`: finite numbers from `low` to `high`.
-
-    Args:
-        kind: `float` or `int`.
-        wanted: What it is and what to give, for the error.
-        low: Least number.
-        high: Greatest number.
-    """
+    """Return a type for `add_argument`: finite numbers from `low` to `high`. `wanted`: what to give, for the error."""
 
     def parse(text: str) -> N:
         with suppress(ValueError):
@@ -202,13 +192,7 @@ def add_address_options(
     option: bool = False,
     code: str = "join code, needed the first time at an encrypted session",
 ) -> None:
-    """Add the options by which a client finds a session: `--address`, `--session`, `--code`.
-
-    Args:
-        parser: Parser of the command.
-        option: Take the address by its option only, because the command has other positional arguments.
-        code: Help text of `--code`.
-    """
+    """Add the options by which a client finds a session. `option`: the address is no positional argument."""
     text = "HOST:PORT or iris://... (default: 127.0.0.1:7721)"
     parser.add_argument("--address", default="", metavar="ADDR", help=text)
     if not option:
@@ -218,18 +202,15 @@ def add_address_options(
 
 
 def check_session_reachable(arguments: argparse.Namespace) -> None:
-    """Raise `CommandError` within `CONNECT_S` if nothing listens at the given address.
-
-    A client would wait for the session to start. A session given by name is not checked: it has no address yet.
-    """
+    """Raise `CommandError` if nothing listens at the given address: a client would wait for the session to start."""
     from iris_session.client.discovery import Address
     from iris_session.client.endpoint_resolver import LOCAL_ADDRESS
 
-    if arguments.session:
+    if arguments.session:  # found by its name, it has no address yet
         return
     address = Address.parse(arguments.address or LOCAL_ADDRESS)
     try:
-        socket.create_connection((address.host, address.port), CONNECT_S).close()
+        socket.create_connection((address.host, address.port), timeout=2.0).close()
     except OSError as error:
         raise CommandError(
             f"no session answers at {address}: is `iris-session serve` running there? "
@@ -239,11 +220,7 @@ def check_session_reachable(arguments: argparse.Namespace) -> None:
 
 
 def make_client(arguments: argparse.Namespace, role: str, name: str) -> Client:
-    """Return a client, not connected yet, for the options of `add_address_options`.
-
-    Raises:
-        CommandError: Nothing listens at the address.
-    """
+    """Return a client, not connected yet, for the options of `add_address_options`. Raises `CommandError`."""
     from iris_session.client import Client
 
     check_session_reachable(arguments)
@@ -261,11 +238,7 @@ def refuse_options(arguments: argparse.Namespace, names: Iterable[str], why: str
 
 
 def find_participant(client: Client, name: str) -> ParticipantInfo:
-    """Return the participant with an id or name.
-
-    Raises:
-        CommandError: No participant, or more than one, has that name. The text lists the candidates.
-    """
+    """Return the participant with an id or name. Raises `CommandError` with the candidates if it is none, or many."""
     people = sorted(client.mirror.participants.values(), key=lambda one: (len(one.id), one.id))
     found = [one for one in people if one.id == name] or [one for one in people if one.name == name]
     if len(found) == 1:
@@ -480,8 +453,6 @@ def report_damage(path: Path, problems: Sequence[str]) -> int:
     return 1 if problems else 0
 
 
-_UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-POSE_FORMAT: Final = "X,Y,Z,QW,QX,QY,QZ"
 #: Comma-separated numbers, the first negative: no option has this form.
 _BEGINS_WITH_MINUS: Final = re.compile(r"-[0-9.][^,]*(,[^,]*)+")
 
@@ -517,7 +488,7 @@ def add_pose_option(parser: argparse.ArgumentParser, description: str) -> None:
         "--pose",
         type=parse_pose,
         required=True,
-        metavar=POSE_FORMAT,
+        metavar="X,Y,Z,QW,QX,QY,QZ",
         help=f"{description}: metres, unit quaternion with w first",
     )
 
@@ -527,4 +498,4 @@ def parse_length(text: str) -> float:
     match = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(mm|cm|m)", text.strip())
     if not match:
         raise argparse.ArgumentTypeError(f"{text!r} is not a length: give a number with its unit, for example 150mm")
-    return float(match[1]) * _UNITS[match[2]]
+    return float(match[1]) * {"mm": 1e-3, "cm": 1e-2, "m": 1.0}[match[2]]

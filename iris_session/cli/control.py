@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 #: Time to be admitted, and for the e-stop to be confirmed [s].
 TIMEOUT_S: Final = 5.0
-#: Time for the event of a change that was granted [s]: it comes just before the reply, if anything changed.
-NEWS_S: Final = 0.5
 #: Roles that may ask for it, the least powerful first: a key may have few of them.
 DIRECTORS: Final = (Role.DIRECTOR,)
 DRIVERS: Final = (Role.AGENT, Role.OPERATOR, Role.LEADER, Role.DIRECTOR)
@@ -260,7 +258,7 @@ def rename_participant(client: Client, arguments: argparse.Namespace) -> Outcome
     person = find_participant(client, arguments.person).id
     before = client.mirror.participants[person].name
     client.request(Rename(0, person, arguments.name))
-    client.wait_for(lambda one: _find_name(one, person) != before, NEWS_S)
+    client.wait_for(lambda one: _find_name(one, person) != before, 0.5)  # it comes with the reply, if it changed
     name = _find_name(client, person)
     return f"{person}: {before} is now {name}", {"participant": person, "name": name}
 

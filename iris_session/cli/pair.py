@@ -188,10 +188,7 @@ def _find_certificate(arguments: argparse.Namespace, home: KeyHome, hosts: list[
 def _find_addresses(
     arguments: argparse.Namespace, home: KeyHome, key: KeyPair
 ) -> tuple[str, list[tuple[str, int]], int]:
-    """Return the name of the session, hosts and ports at which others reach it, best first, and the page's port.
-
-    The port is 0 for a session without a page.
-    """
+    """Return the session's name, hosts and ports at which others reach it, best first, and the page's port or 0."""
     from iris_session.client.discovery import Address
 
     here = [note for note in home.sessions.read() if note.server == key.fingerprint]

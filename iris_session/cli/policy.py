@@ -41,7 +41,6 @@ HZ: Final = 30.0
 PATIENCE_S: Final = 0.1
 #: After so long without a decision it commands nothing: robots hold, as for everything that has stopped [s].
 STUCK_S: Final = 1.0
-REPORT_S: Final = 1.0
 NO_LEROBOT: Final = (
     "LeRobot is not installed here: make an environment with both, pip install lerobot 'iris-session[env,files]'"
 )
@@ -79,19 +78,11 @@ def register(commands: Commands) -> None:
 
 
 class LeRobotPolicy:
-    """A checkpoint of LeRobot with its normalisation.
-
-    Args:
-        repo: Folder of the checkpoint, or its name on the hub.
-        device: Of torch.
-        task: Text for policies that read one.
+    """A checkpoint of LeRobot, a folder or a name on the hub, with its normalisation. Raises `CommandError`.
 
     Attributes:
         inputs: Shapes of the observations that it needs, by their name in the data set; pictures (3, h, w).
         n_actions: Numbers of an action.
-
-    Raises:
-        CommandError: LeRobot is not installed, or the checkpoint cannot be loaded.
     """
 
     def __init__(self, repo: str, device: str = "cpu", task: str = "") -> None:
@@ -280,7 +271,7 @@ class RunLog:
             self._interventions[robot] += state == INTERVENTION != self._states.get(robot)
             states[robot] = state
         self._states = states
-        if now_s - self._reported_s >= REPORT_S:
+        if now_s - self._reported_s >= 1.0:
             self._report(info, now_s)
         return states
 

@@ -396,13 +396,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
 
 
 def list_files(given: Sequence[Path], on_error: Callable[[OSError], None]) -> list[Path]:
-    """Return the recordings to verify: in place of a folder, all in and below it.
-
-    `on_error`: called for every folder that cannot be read.
-
-    Raises:
-        CommandError: There is none in a folder.
-    """
+    """Return the recordings to verify: in place of a folder, all in and below it; `CommandError` if there is none."""
     from iris_session.recording.folders import find_recordings
 
     files: list[Path] = []

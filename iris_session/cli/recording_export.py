@@ -23,7 +23,6 @@ from iris_session.cli.common import (
 from iris_session.cli.progress import ProgressLine
 from iris_session.dataset.formats import FORMATS as DATASETS
 
-DEFAULT_HZ: Final = 100.0
 #: What `--to` may be: formats of tables, and the other thing that is exported.
 FORMATS: Final = ("csv", "parquet", "npz")
 ASSETS: Final = "assets"
@@ -56,7 +55,7 @@ def register(actions: Commands) -> None:
         """,
     )
     parser.add_argument(
-        "paths", type=Path, nargs="+", metavar="RECORDING", help="a .rrd or a folder; a data set: several"
+        "paths", type=Path, nargs="+", metavar="RECORDING", help="a .rrd or folder; for a data set several"
     )
     formats = (*DATASETS, *FORMATS, ASSETS)
     parser.add_argument("--to", required=True, choices=formats, help="format of the data set or tables, or assets")
@@ -96,7 +95,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     from iris_session.replay.recorded_session import SessionRecording
 
     options = ExportOptions(
-        DEFAULT_HZ if arguments.hz is None else arguments.hz,
+        arguments.hz or 100.0,
         tuple(arguments.table) or TABLES,
         tuple(arguments.robot),
         tuple(arguments.object),

@@ -33,8 +33,6 @@ MAX_SIDE: Final = 8192
 DEFAULT_FPS: Final = 30.0
 #: An animation is held in memory, and its colours are chosen when all of it is there: this many pixels at most.
 MAX_ANIMATION_PIXELS: Final = 100_000_000
-#: Colours of an animation; more make it larger.
-COLOURS: Final = 200
 #: Codecs of a video in the order of preference, by their names in OpenCV: browsers play the first.
 _CODECS: Final = {"vp09": "VP9", "mp4v": "MPEG-4 Part 2, which no browser plays"}
 _SECOND: Final = 1_000_000_000
@@ -153,11 +151,7 @@ def _check_output(arguments: argparse.Namespace) -> Path:
 
 
 def list_times(arguments: argparse.Namespace, timeline: Timeline) -> Sequence[int]:
-    """Return the session times of the pictures [ns], ascending.
-
-    Raises:
-        CommandError: The recording has no such times, or an animation of all of them is too large.
-    """
+    """Return the session times of the pictures [ns], ascending. Raises `CommandError`."""
     first_s, last_s = timeline.begin_ns / _SECOND, timeline.end_ns / _SECOND
     begin_s = first_s if arguments.begin is None else arguments.begin
     end_s = last_s if arguments.end is None else arguments.end
@@ -247,7 +241,7 @@ def _write_animation(file: BinaryIO, images: Sequence[Image], frame_ms: int) -> 
     from PIL import Image as Pillow
 
     frames = [Pillow.fromarray(image) for image in images]
-    palette = frames[len(frames) // 2].quantize(COLOURS)
+    palette = frames[len(frames) // 2].quantize(colors=200)
     frames = [frame.quantize(palette=palette, dither=Pillow.Dither.NONE) for frame in frames]
     frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=frame_ms, loop=0, optimize=True)
 

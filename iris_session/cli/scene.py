@@ -180,7 +180,7 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise CommandError(f"{out} is the input file: give another output file")
     with files_read() as files:
         parsed, store = _parse_scene(arguments)
-    if any(_is_same_file(path, out) for path in (*files, *_list_model_files(arguments.scene))):
+    if any(_is_same_file(path, out) for path in files):
         raise CommandError(f"{out} is part of {arguments.scene}: give another output file")
     try:
         size = write_glb(parsed.spec, store, out)
@@ -201,17 +201,6 @@ def run_export(arguments: argparse.Namespace) -> int:
         [f"{out}: {_format_size(size)}"],
     )
     return 0
-
-
-def _list_model_files(scene: str) -> list[Path]:
-    """Return the files that an MJCF file refers to."""
-    path = expand_path(scene)
-    if path.suffix.lower() not in (".xml", ".mjcf") or not path.is_file():
-        return []
-    import mujoco
-
-    names = getattr(mujoco, "mju_getXMLDependencies", None)  # since MuJoCo 3.3.7
-    return [] if names is None else [Path(name) for name in names(str(path))]
 
 
 def _is_same_file(a: Path, b: Path) -> bool:
@@ -257,9 +246,6 @@ def _format_size(n_bytes: int) -> str:
 
 #: Suffixes of files that MuJoCo simulates; any other file is composed and shown as it is.
 SIMULATED: Final = (".xml", ".mjcf", ".mjb")
-#: Limits above which work takes longer than about a second and progress is printed.
-_LARGE_FILE_BYTES: Final = 5_000_000
-_MANY_TRIANGLES: Final = 100_000
 
 
 def add_file_options(parser: argparse.ArgumentParser) -> None:
@@ -290,11 +276,7 @@ def expand_path(text: str | Path) -> Path:
 
 
 def find_scene_file(scene: str) -> Path | None:
-    """Return the file to show, or `None` if the scene is for MuJoCo: a model, or a name.
-
-    Raises:
-        CommandError: It is a folder, or a file that does not exist or has an unknown suffix.
-    """
+    """Return the file to show, `None` if the scene is for MuJoCo: a model, or a name. Raises `CommandError`."""
     from iris_session.demo.scene_names import SCENE_NAMES
     from iris_session.scene.importers.references import ENDINGS, check_present, xacro_advice
 
@@ -336,7 +318,7 @@ def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneB
     from iris_session.scene.builder import SceneBuilder
 
     builder, scale = SceneBuilder(name), 1.0 if arguments.scale is None else arguments.scale
-    if (size := path.stat().st_size) > _LARGE_FILE_BYTES:
+    if (size := path.stat().st_size) > 5_000_000:  # more than about a second
         print(f"reading {path.name} ({size / 1e6:.1f} MB)", file=sys.stderr, flush=True)
     try:
         if path.suffix.lower() == ".urdf":
@@ -346,7 +328,7 @@ def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneB
     except SceneBuildError as error:
         advice = " (here: --package-dir DIR)" if "package_dirs" in str(error) else ""
         raise CommandError(f"{error}{advice}") from None
-    if builder.triangles > _MANY_TRIANGLES:
+    if builder.triangles > 100_000:
         text = f"preparing meshes of {path.name} ({builder.triangles:,} triangles; cached for the next time)"
         print(text, file=sys.stderr, flush=True)
     return builder

@@ -121,10 +121,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def open_status(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusReport]]:
-    """Join a session as an observer. Yield the client and the status.
-
-    A stalled session admits no participant, but answers a request for its status.
-    """
+    """Join a session as an observer. Yield the client and the status, which a stalled session answers, too."""
     from iris_session.client import NotConnectedError, RequestTimeoutError
 
     client = make_client(arguments, "observer", "status")

@@ -40,10 +40,6 @@ END_S: Final = 3.0
 POLL_S: Final = 0.05
 #: Memory that the server of a page may take at least, in bytes: Rerun's default.
 MIN_MEMORY: Final = 1 << 30
-#: Added to the nice value of a viewer beside a session that runs.
-LIVE_NICE: Final = 10
-#: Bytes of the messages of a viewer that has failed.
-MOST_WORDS: Final = 10_000
 
 
 def register(commands: Commands) -> None:
@@ -95,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     tool = find_rerun()
     if arguments.live:
         live = find_live(arguments.path or DEFAULT_FOLDER)
-        os.nice(LIVE_NICE)  # the session comes first
+        os.nice(10)  # the session comes first
         print(f"follows {to_printable(str(live))} until the session ends", flush=True)
         with ending_as_interrupts():
             return _show(tool, arguments, None, live)
@@ -112,11 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def find_live(path: Path) -> Path:
-    """Return the first file of a recording that is being written: of a session, or the newest in or below a folder.
-
-    Raises:
-        CommandError: There is none.
-    """
+    """Return the first file of a recording that is being written, the newest of a folder. Raises `CommandError`."""
     from iris_session.recording.folders import find_newest_s, find_recordings, list_session_files
     from iris_session.recording.lock import is_being_written
 
@@ -130,11 +122,7 @@ def find_live(path: Path) -> Path:
 
 
 def choose_recording(path: Path) -> Path:
-    """Return the recording to show. The newest of a folder; the others are listed.
-
-    Raises:
-        CommandError: There is none.
-    """
+    """Return the recording to show: the newest of a folder, whose others are printed. Raises `CommandError`."""
     if not path.is_dir():
         if not path.exists():
             raise CommandError(f"{path} does not exist: give a recording (session.rrd), or a folder with recordings")
@@ -241,7 +229,7 @@ def live_viewer(recording: Path | None, out: TextIO) -> Iterator[None]:
             yield
             if viewer.exit_status:
                 words.seek(0)
-                print(words.read(MOST_WORDS).decode(errors="replace").strip(), file=sys.stderr)
+                print(words.read(10_000).decode(errors="replace").strip(), file=sys.stderr)
         finally:
             viewer.close(terminate_s=END_S + 1.0)
 
