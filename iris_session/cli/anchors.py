@@ -47,7 +47,6 @@ ALL_PARTICIPANTS: Final = "all"
 
 
 def register(commands: Commands) -> None:
-    """Add the command `anchors`."""
     actions = add_actions(
         commands,
         "anchors",
@@ -65,7 +64,6 @@ def register(commands: Commands) -> None:
 
 
 def _register_print(actions: Commands) -> None:
-    """Add the action `print`."""
     one = add_command(
         actions,
         "print",
@@ -96,7 +94,6 @@ def _register_print(actions: Commands) -> None:
 
 
 def _register_example(actions: Commands) -> None:
-    """Add the action `example`."""
     one = add_command(
         actions,
         "example",
@@ -125,7 +122,6 @@ def _add_layout_option(parser: argparse.ArgumentParser) -> None:
 
 
 def _register_status(actions: Commands) -> None:
-    """Add the action `status`."""
     one = add_command(
         actions,
         "status",
@@ -144,7 +140,6 @@ def _register_status(actions: Commands) -> None:
 
 
 def _register_align(actions: Commands) -> None:
-    """Add the action `align`."""
     one = add_command(
         actions,
         "align",
@@ -170,7 +165,6 @@ def _register_align(actions: Commands) -> None:
 
 
 def _register_place(actions: Commands) -> None:
-    """Add the action `place`."""
     one = add_command(
         actions,
         "place",
@@ -190,7 +184,6 @@ def _register_place(actions: Commands) -> None:
 
 
 def _register_move(actions: Commands) -> None:
-    """Add the action `move`."""
     one = add_command(
         actions,
         "move",
@@ -242,8 +235,7 @@ def run_print(arguments: argparse.Namespace) -> int:
     result = {"file": str(out), "id": sheet.anchor_id, "size_m": sheet.edge_m, "paper": arguments.paper}
     result |= {"layout": sheet.layout, "for_headsets": sheet.edge_m >= HEADSET_MIN_EDGE_M}
     result |= {"markers": sheet.marker_ids, "marker_edge_m": sheet.marker_edge_m, "marks_m": sheet.marks}
-    print_result(arguments, result, lines)
-    return 0
+    return print_result(arguments, result, lines)
 
 
 def _print_measured(arguments: argparse.Namespace, sheet: Sheet, size_m: float) -> int:
@@ -255,8 +247,7 @@ def _print_measured(arguments: argparse.Namespace, sheet: Sheet, size_m: float) 
             "size that it was printed for by --size"
         )
     result = {"id": sheet.anchor_id, "size_m": sheet.edge_m, "printed_for_m": size_m, "marks_m": sheet.marks}
-    print_result(arguments, result, [f"[anchors.{json.dumps(sheet.anchor_id)}]", *_list_file_lines(sheet)])
-    return 0
+    return print_result(arguments, result, [f"[anchors.{json.dumps(sheet.anchor_id)}]", *_list_file_lines(sheet)])
 
 
 def _list_file_lines(sheet: Sheet) -> list[str]:
@@ -313,8 +304,7 @@ def run_align(arguments: argparse.Namespace) -> int:
     started = arguments.what == AlignAction.START
     outcome = "started: bring the sheets into view" if started else "stopped: alignment kept"
     lines = (f"{one['name']} ({one['id']}): {one['denied'] or outcome}" for one in done)
-    print_result(arguments, {"ok": ok, "action": arguments.what, "participants": done}, lines)
-    return 0 if ok else 1
+    return print_result(arguments, {"ok": ok, "action": arguments.what, "participants": done}, lines, ok=ok)
 
 
 def run_place(arguments: argparse.Namespace) -> int:
@@ -324,8 +314,7 @@ def run_place(arguments: argparse.Namespace) -> int:
         client.alignment.place(one.id, arguments.pose, offset=arguments.offset)
     line = f"{one.name} ({one.id}) is {'moved by the offset' if arguments.offset else 'placed'}"
     result = {"ok": True, "participant": {"id": one.id, "name": one.name}, "offset": arguments.offset}
-    print_result(arguments, result, [line])
-    return 0
+    return print_result(arguments, result, [line])
 
 
 def run_move(arguments: argparse.Namespace) -> int:
@@ -347,8 +336,7 @@ def run_move(arguments: argparse.Namespace) -> int:
     first = f"anchor '{arguments.anchor}' {by}: {len(follow)} alignments measured to it follow"
     ids = {"follow": [p.id for p in follow], "stay": list(stay)}
     result = {"ok": True, "anchor": arguments.anchor, "moved_m": moved_m, **ids}
-    print_result(arguments, result, [first, *(f"    unchanged: {line}" for line in stay.values())])
-    return 0
+    return print_result(arguments, result, [first, *(f"    unchanged: {line}" for line in stay.values())])
 
 
 def explain_unaffected_alignment(p: ParticipantReport, anchor: str) -> str:

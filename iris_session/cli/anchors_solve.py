@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 
 def register(actions: Commands) -> None:
-    """Add the action `solve`."""
     one = add_command(
         actions,
         "solve",

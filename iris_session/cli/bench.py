@@ -130,7 +130,6 @@ _TEXTS: Final = {
 
 
 def register(commands: Commands) -> None:
-    """Add the command `bench`."""
     names = add_actions(
         commands,
         "bench",

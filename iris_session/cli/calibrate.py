@@ -145,7 +145,6 @@ def _list_poses(result: dict[str, Any]) -> list[tuple[str, dict[str, list[float]
 
 
 def register_camera(actions: Commands) -> None:
-    """Add the action `calibrate-camera`."""
     one = add_command(
         actions,
         "calibrate-camera",
@@ -195,8 +194,7 @@ def run_camera(arguments: argparse.Namespace) -> int:
         raise CommandError(str(error), status=1) from error
     if arguments.out is not None:
         write_file(arguments.out, calibration_to_toml(result))
-    print_result(arguments, result, format_calibration(result))
-    return 0
+    return print_result(arguments, result, format_calibration(result))
 
 
 def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -330,7 +328,6 @@ class CameraFrames(NamedTuple):
 
 
 def register_depth_cameras(actions: Commands) -> None:
-    """Add the action `calibrate` of `cloud`."""
     parser = add_command(
         actions,
         "calibrate",
@@ -399,8 +396,7 @@ def run_depth_cameras(arguments: argparse.Namespace) -> int:
         is_beside = arguments.out.absolute().parent == arguments.file.absolute().parent
         name = json.dumps(arguments.out.name if is_beside else str(arguments.out.absolute()), ensure_ascii=False)
         lines.append(f"{arguments.out}: name it in each camera of {arguments.file}: calibration = {name}")
-    print_result(arguments, result, lines)
-    return 0
+    return print_result(arguments, result, lines)
 
 
 def _print_check(arguments: argparse.Namespace, settings: CloudSettings, placed: Mapping[str, PlacedCamera]) -> int:
@@ -426,8 +422,7 @@ def _print_check(arguments: argparse.Namespace, settings: CloudSettings, placed:
         f"errors explain {found['limit_mm']:.1f} mm"
         for name, found in cameras.items()
     )
-    print_result(arguments, {"ok": is_well, "cameras": cameras}, lines)
-    return 0 if is_well else 1
+    return print_result(arguments, {"ok": is_well, "cameras": cameras}, lines, ok=is_well)
 
 
 def _find_known_sheets(arguments: argparse.Namespace) -> KnownSheets:

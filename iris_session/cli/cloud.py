@@ -22,12 +22,14 @@ from iris_session.cli.common import (
     add_actions,
     add_address_options,
     add_command,
+    handling_signals,
     make_client,
     parse_seconds,
     print_error,
     print_json,
     print_result,
     to_printable,
+    write_file,
 )
 from iris_session.protocol.errors import IrisError
 from iris_session.protocol.names import MediaEncoding, Role
@@ -44,7 +46,6 @@ log = logging.getLogger(__name__)
 
 
 def register(commands: Commands) -> None:
-    """Add the command `cloud` with its actions."""
     actions = add_actions(
         commands,
         "cloud",
@@ -131,7 +132,9 @@ def run_file(arguments: argparse.Namespace) -> int:
     lower_thread_priority()
     seconds = math.inf if arguments.seconds is None else arguments.seconds
     printer = _ReportPrinter(as_json=arguments.json)
-    with _catch_signals() as ending, _name_unexpected_error(settings):
+    ending = threading.Event()  # a driver is not interrupted in the middle of its work
+    catching = handling_signals(lambda *_: ending.set(), signal.SIGINT, signal.SIGTERM)
+    with catching, _name_unexpected_error(settings):
         fault = run_cameras(settings, client, printer, lambda: ending.is_set() or printer.passed_s >= seconds)
         if not (fault or printer.was_connected or ending.is_set()):
             where = arguments.address or arguments.session or "of this machine"
@@ -140,18 +143,6 @@ def run_file(arguments: argparse.Namespace) -> int:
     if fault:
         print_error(fault)
     return 1 if fault else 0
-
-
-@contextmanager
-def _catch_signals() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C and SIGTERM set, instead of interrupting a driver in the middle of its work."""
-    ending = threading.Event()
-    before = {one: signal.signal(one, lambda *_: ending.set()) for one in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield ending
-    finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
 
 
 @contextmanager
@@ -235,13 +226,9 @@ def run_example(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         sys.stdout.write(text)
         return 0
-    try:
-        with arguments.out.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise CommandError(f"{arguments.out} exists: give another file, or remove it first") from None
-    except OSError as error:
-        raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from None
+    if arguments.out.exists():
+        raise CommandError(f"{arguments.out} exists: give another file, or remove it first")
+    write_file(arguments.out, text)
     print(f"{arguments.out}: edit it, then `iris-session cloud inspect {arguments.out}`")
     return 0
 
@@ -293,8 +280,9 @@ def _inspect_file(arguments: argparse.Namespace, path: Path) -> int:
         finally:
             worker.close()
     is_well = report.hz > 0.0 and not format_faults(report)
-    print_result(arguments, {"ok": is_well, **msgspec.to_builtins(report)}, format_inspection(settings, report))
-    return 0 if is_well else 1
+    return print_result(
+        arguments, {"ok": is_well, **msgspec.to_builtins(report)}, format_inspection(settings, report), ok=is_well
+    )
 
 
 def _run_worker(worker: CloudWorker, seconds: float, is_done: Any) -> None:
@@ -354,8 +342,7 @@ def _inspect_session(arguments: argparse.Namespace) -> int:
     is_well = bool(found) and all(one.frames and not one.fault and not one.stale for one in found)
     none = "the session has no cloud: `iris-session serve --camera FILE`, or `iris-session cloud run FILE`"
     lines = [line for one in found for line in _format_stream(one)] or [none]
-    print_result(arguments, {"ok": is_well, "streams": found}, lines)
-    return 0 if is_well else 1
+    return print_result(arguments, {"ok": is_well, "streams": found}, lines, ok=is_well)
 
 
 def _format_stream(one: StreamMeasurement) -> Iterator[str]:

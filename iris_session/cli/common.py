@@ -11,9 +11,10 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NoReturn, TypeAlias, TypeVar
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar
 
 from anchors.pose import quat_normalize
 from iris_session.protocol.errors import IrisError
@@ -46,23 +47,35 @@ class CommandError(IrisError):
         self.status = status
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn an `OSError` into a `CommandError` about a file that cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise CommandError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
 def write_file(path: Path, content: bytes | str) -> None:
     """Write the file of an option, completely or not at all. Raises `CommandError`."""
-    try:
+    with writing(path):
         write_output(path, content.encode() if isinstance(content, str) else content)
-    except OSError as error:
-        raise CommandError(f"{path} cannot be written: {error.strerror}") from error
 
 
 @contextmanager
-def ending_as_interrupts() -> Iterator[None]:
-    """Take SIGTERM and a closed terminal as Ctrl-C, so that nothing is left behind."""
-    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGTERM, signal.SIGHUP)}
+def handling_signals(handler: Callable[[int, FrameType | None], Any], *numbers: signal.Signals) -> Iterator[None]:
+    """Handle signals while the block runs."""
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, previous in before.items():
+            signal.signal(number, previous)
+
+
+def ending_as_interrupts() -> AbstractContextManager[None]:
+    """Take SIGTERM and a closed terminal as Ctrl-C while the block runs, so that nothing is left behind."""
+    return handling_signals(signal.default_int_handler, signal.SIGTERM, signal.SIGHUP)
 
 
 def make_number_type(kind: Callable[[str], N], wanted: str, low: float, high: float = math.inf) -> Callable[[str], N]:
@@ -417,12 +430,13 @@ def print_json(value: object) -> None:
     print(json.dumps(value, allow_nan=False, default=to_builtins), flush=True)
 
 
-def print_result(arguments: argparse.Namespace, value: object, lines: Iterable[str]) -> None:
-    """Print the result of a command: one JSON object for `--json`, else lines, made printable."""
+def print_result(arguments: argparse.Namespace, value: object, lines: Iterable[str], *, ok: bool = True) -> int:
+    """Print the result of a command, for `--json` one object, else printable lines. Return the exit status."""
     if arguments.json:
         print_json(value)
     else:
         print("\n".join(map(to_printable, lines)), flush=True)
+    return 0 if ok else 1
 
 
 def list_first(lines: Sequence[str], most: int = MOST_LINES) -> list[str]:

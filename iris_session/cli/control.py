@@ -52,9 +52,6 @@ Action = Callable[["Client", argparse.Namespace], Outcome]
 
 
 def register(commands: Commands) -> None:
-    """Add the commands `estop`, `clear-estop`, `pause`, `resume`, `reset`, `assign`, `release`, `mode`, `rename`,
-    `role`, `episode` and `marker`.
-    """
     estop = _add_command(
         commands,
         "estop",
@@ -155,8 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
             reason = denied or (error.code if isinstance(error, RefusedError) else "no_answer")
             print_json({**result, "ok": False, "reason": reason, "error": text})
         return error.status if isinstance(error, CommandError) else 1
-    print_result(arguments, result | fields, [text])
-    return 0
+    return print_result(arguments, result | fields, [text])
 
 
 @contextmanager

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 
 def register(commands: Commands) -> None:
-    """Add the command `demo`."""
     parser = add_command(
         commands,
         "demo",

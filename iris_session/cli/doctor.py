@@ -20,7 +20,6 @@ MARKS: Final = {"ok": "ok     ", "warning": "WARNING", "failed": "FAILED ", "ski
 
 
 def register(commands: Commands) -> None:
-    """Add the command `doctor`."""
     parser = add_command(
         commands,
         "doctor",
@@ -68,8 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
             on_progress=show_progress,
         )
     lines = [*format_findings(result.findings, show_skipped=arguments.all), format_verdict(result.findings)]
-    print_result(arguments, result.as_dict(), lines)
-    return 0 if result.ok else 1
+    return print_result(arguments, result.as_dict(), lines, ok=result.ok)
 
 
 def format_findings(findings: Iterable[Finding], *, show_skipped: bool = False) -> Iterator[str]:

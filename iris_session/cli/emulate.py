@@ -17,7 +17,6 @@ from iris_session.cli.common import (
 
 
 def register(commands: Commands) -> None:
-    """Add the command `emulate`."""
     parser = add_command(
         commands,
         "emulate",

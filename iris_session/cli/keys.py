@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 
 def register(commands: Commands) -> None:
-    """Add the command `keys`."""
     actions = add_actions(
         commands,
         "keys",
@@ -88,8 +87,9 @@ def run_list(arguments: argparse.Namespace) -> int:
         f"{', '.join(one.roles) or 'any role'}  added {one.added or 'manually'}  last seen {one.last_seen or 'never'}"
         for mark, one in keys.items()
     ]
-    print_result(arguments, {"keys": rows}, lines or ["no keys are allowed yet: `iris-session pair` adds a new device"])
-    return 0
+    return print_result(
+        arguments, {"keys": rows}, lines or ["no keys are allowed yet: `iris-session pair` adds a new device"]
+    )
 
 
 def run_allow(arguments: argparse.Namespace) -> int:
@@ -139,8 +139,7 @@ def run_show(arguments: argparse.Namespace) -> int:
         f"you as a client   {_format_key(own, 'created when you join an encrypted session')}",
         f"page for browsers {text}",
     ]
-    print_result(arguments, {"home": str(home.path), **keys}, lines)
-    return 0
+    return print_result(arguments, {"home": str(home.path), **keys}, lines)
 
 
 def _key_to_dict(pair: KeyPair | None) -> dict[str, str] | None:

@@ -19,6 +19,7 @@ from iris_session.cli.common import (
     print_error,
     print_json,
     print_result,
+    writing,
 )
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import DEFAULT_ROLES
@@ -43,7 +44,6 @@ FAILURE_TEXTS: Final = {
 
 
 def register(commands: Commands) -> None:
-    """Add the command `pair`."""
     parser = add_command(
         commands,
         "pair",
@@ -165,10 +165,8 @@ def _write_pairing_file(
         "code": invitation["code"],
         "expires": invitation["expires"],
     }
-    try:
+    with writing(path):
         write_atomic(path, json.dumps(pairing, indent=2).encode() + b"\n", permissions=0o600)
-    except OSError as error:
-        raise CommandError(f"{path} cannot be written: {error.strerror}") from error
     if all(is_loopback(host) for host in hosts):
         print_error(
             f"{hosts[0]} is this machine alone: a headset reaches it only by cable, after `adb reverse tcp:{web} "
@@ -247,10 +245,8 @@ def _print_invitation(arguments: argparse.Namespace, invitation: dict[str, Any])
 
     qr = segno.make(invitation["page"] if arguments.web else invitation["uri"], micro=False, error="m")
     if arguments.png is not None:
-        try:
+        with writing(arguments.png):
             qr.save(str(arguments.png), kind="png", scale=10, border=4)
-        except OSError as error:
-            raise CommandError(f"{arguments.png} cannot be written: {error.strerror}") from error
     if arguments.json:
         print_json(invitation)
         return

@@ -50,7 +50,6 @@ Observation = Mapping[str, Any]
 
 
 def register(commands: Commands) -> None:
-    """Add the command `policy`."""
     parser = add_command(
         commands,
         "policy",

@@ -44,7 +44,6 @@ _CLASSES: Final = {
 
 
 def register(commands: Commands) -> None:
-    """Add the commands `verify` and `recording`."""
     _register_verify(commands)
     actions = add_actions(
         commands,
@@ -100,8 +99,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         if path.is_dir():
             return _inspect_folder(path, as_json=arguments.json)
         summary = _summarise_file(path)
-    print_result(arguments, summary, format_summary(summary))
-    return 0 if summary.ok else 1
+    return print_result(arguments, summary, format_summary(summary), ok=summary.ok)
 
 
 def _inspect_folder(folder: Path, *, as_json: bool) -> int:
@@ -326,8 +324,7 @@ def run_repair(arguments: argparse.Namespace) -> int:
         raise CommandError(f"{path} does not exist: give a recording (session.rrd), or its folder")
     with ending_as_interrupts(), ReadingProgress(path) as progress:
         report = repair(path, arguments.out, overwrite=arguments.force, progress=progress.show_bytes)
-    print_result(arguments, report, format_repair(report))
-    return 0 if report.ok else 1
+    return print_result(arguments, report, format_repair(report), ok=report.ok)
 
 
 def format_repair(report: RepairReport) -> Iterator[str]:

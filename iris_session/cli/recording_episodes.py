@@ -34,7 +34,6 @@ _EDITS: Final = ("drop", "keep", "trim", "label", "task", "reset")
 
 
 def register(actions: Commands) -> None:
-    """Add the action `episodes` of `recording`."""
     parser = add_command(
         actions,
         "episodes",

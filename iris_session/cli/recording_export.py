@@ -31,7 +31,6 @@ _TABLES: Final = ("hz", "robot", "object", "table")
 
 
 def register(actions: Commands) -> None:
-    """Add the command `export`, and the action of `recording`, which are the same."""
     parser = add_command(
         actions,
         "export",

@@ -17,6 +17,7 @@ from iris_session.cli.common import (
     make_number_type,
     print_result,
     report_damage,
+    writing,
 )
 from iris_session.cli.progress import ProgressLine
 from iris_session.system.files import Replacement
@@ -39,7 +40,6 @@ _SECOND: Final = 1_000_000_000
 
 
 def register(actions: Commands) -> None:
-    """Add the action `render` of `recording`."""
     parser = add_command(
         actions,
         "render",
@@ -189,17 +189,14 @@ def _draw(pictures: RecordingPictures, times_ns: Sequence[int], progress: Progre
 def _write(out: Path, arguments: argparse.Namespace, images: Iterator[Image], n_images: int) -> str:
     """Write the file, as a whole or not at all. Return the name of its codec."""
     kind = out.suffix.lower()
-    try:
-        with Replacement(out, permissions=None, suffix=kind) as replacement:
-            if kind == VIDEO:
-                return _write_video(replacement.temporary, images, n_images, arguments.size, arguments.fps)
-            if kind == ANIMATION:
-                _write_animation(replacement.file, list(images), round(1000 / arguments.fps))
-                return "GIF"
-            _write_picture(replacement.file, next(images))
-            return "PNG"
-    except OSError as error:
-        raise CommandError(f"{out} cannot be written: {error.strerror or error}") from error
+    with writing(out), Replacement(out, permissions=None, suffix=kind) as replacement:
+        if kind == VIDEO:
+            return _write_video(replacement.temporary, images, n_images, arguments.size, arguments.fps)
+        if kind == ANIMATION:
+            _write_animation(replacement.file, list(images), round(1000 / arguments.fps))
+            return "GIF"
+        _write_picture(replacement.file, next(images))
+        return "PNG"
 
 
 def _write_video(path: Path, images: Iterator[Image], n_images: int, size: tuple[int, int], fps: float) -> str:

@@ -43,7 +43,6 @@ class _ParsedScene(NamedTuple):
 
 
 def register(commands: Commands) -> None:
-    """Add the commands `robots` and `scene`."""
     _register_robots(commands)
     actions = add_actions(
         commands,
@@ -134,8 +133,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     extent = compute_extent(parsed.spec, store)
     found = build_report(parsed.spec, parsed.scene_hash, parsed.skipped, extent)
     result = {**msgspec.to_builtins(found), "notes": parsed.notes}
-    print_result(arguments, result, _format_report(parsed.spec, found, parsed.notes))
-    return 0
+    return print_result(arguments, result, _format_report(parsed.spec, found, parsed.notes))
 
 
 def _format_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -> Iterator[str]:

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
 
 def register(commands: Commands) -> None:
-    """Add the command `serve`."""
     parser = add_command(
         commands,
         "serve",

@@ -34,7 +34,6 @@ FIRST_REPORT_S: Final = 1.2
 
 
 def register(commands: Commands) -> None:
-    """Add the commands `sessions` and `status`."""
     _register_sessions(commands)
     parser = add_command(
         commands,
@@ -84,8 +83,7 @@ def run_sessions(arguments: argparse.Namespace) -> int:
     rows = [pick_attributes(one, *names) | mark for one, mark in zip(found, marks, strict=True)]
     lines = [f"{row['name']:<24} {row['address']:<24} {row['kind']:<8} {_format_key(row)}" for row in rows]
     none = "no session was heard: type the address of a session, or scan its code (docs/network.md)"
-    print_result(arguments, {"ok": bool(rows), "sessions": rows}, lines or [none])
-    return 0 if rows else 1
+    return print_result(arguments, {"ok": bool(rows), "sessions": rows}, lines or [none], ok=bool(rows))
 
 
 def _format_key(row: dict[str, object]) -> str:

@@ -43,7 +43,6 @@ MIN_MEMORY: Final = 1 << 30
 
 
 def register(commands: Commands) -> None:
-    """Add the command `view`."""
     parser = add_command(
         commands,
         "view",

@@ -20,7 +20,6 @@ CONNECT_S = 15.0
 
 
 def register(commands: Commands) -> None:
-    """Add the command `web`."""
     parser = add_command(
         commands,
         "web",
