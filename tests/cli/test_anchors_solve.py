@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,12 @@ from anchors.alignment import AlignmentEstimate
 from anchors.constellation import Constellation
 from anchors.pose import PoseTuple, compose, distance, inverse
 from iris_session.alignment.smoother import AlignmentSmoother, AnchorHistory, fuse_estimates
-from iris_session.cli.main import main
 from iris_session.protocol.common import IDENTITY, Alignment, Pose
 from iris_session.protocol.server_messages import AnchorMoved
 from iris_session.recording import Recording, TrackingFrame, read_alignment_history
 from iris_session.session.config import load_anchors
 from tests.anchors.worlds import shifted, tracking_frame
+from tests.cli.conftest import CommandLine
 from tests.recording.headsets import Played
 
 Capture = pytest.CaptureFixture[str]
@@ -62,9 +61,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return play().write(tmp_path_factory.mktemp("solve") / "session.rrd")
 
 
-def solve(capsys: Capture, *words: str) -> dict[str, Any]:
-    assert main(["anchors", "solve", *words, "--json"]) == 0
-    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+def solve(cli: CommandLine, *words: str) -> dict[str, Any]:
+    result: dict[str, Any] = cli.json("anchors", "solve", *words)
     return result
 
 
@@ -144,25 +142,24 @@ def test_unusable_observations_are_counted(tmp_path: Path, capsys: Capture) -> N
     assert frame["unused"] == {"unknown anchor": 5, "wrong size": 6}
 
 
-def test_recordings_without_headsets_or_with_one_sheet(tmp_path: Path, capsys: Capture) -> None:
+def test_recordings_without_headsets_or_with_one_sheet(tmp_path: Path, cli: CommandLine) -> None:
     played = Played({"table": TRUE["table"]})
     empty = str(played.write(tmp_path / "empty.rrd"))
-    assert main(["anchors", "solve", empty]) == 0
-    assert "headset" in capsys.readouterr().out
-    assert main(["anchors", "solve", empty, "--out", str(tmp_path / "x.toml")]) == 1
-    assert capsys.readouterr().err.endswith(
+    assert "headset" in cli.run("anchors", "solve", empty)
+    assert cli.refuse("anchors", "solve", empty, "--out", tmp_path / "x.toml", status=1).endswith(
         "is not written: 0 sheets were seen: 2 are needed to say where they lie to each other\n"
     )
     assert not (tmp_path / "x.toml").exists()
 
 
-def test_solve_reports_unusable_files(tmp_path: Path, recording: Path, capsys: Capture) -> None:
-    assert main(["anchors", "solve", str(tmp_path / "none.rrd")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert main(["anchors", "solve", str(recording), "--anchors", str(tmp_path / "none.toml")]) == 2
-    assert "`iris-session anchors example`" in capsys.readouterr().err
-    assert main(["anchors", "solve", str(recording), "--out", str(tmp_path / "no" / "folder.toml")]) == 2
-    assert "cannot be written" in capsys.readouterr().err
+def test_solve_reports_unusable_files(tmp_path: Path, recording: Path, cli: CommandLine) -> None:
+    assert cli.refuse("anchors", "solve", tmp_path / "none.rrd").count("\n") == 1
+    assert "`iris-session anchors example`" in cli.refuse(
+        "anchors", "solve", str(recording), "--anchors", str(tmp_path / "none.toml")
+    )
+    assert "cannot be written" in cli.refuse(
+        "anchors", "solve", str(recording), "--out", str(tmp_path / "no" / "folder.toml")
+    )
 
 
 def test_solutions_of_both_sides_are_weighted_by_their_covariance() -> None:

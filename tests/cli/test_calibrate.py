@@ -30,6 +30,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from render_sheet import Conditions, Page, photograph
 
+from tests.cli.conftest import CommandLine
+
 Capture = pytest.CaptureFixture[str]
 
 
@@ -138,7 +140,7 @@ def test_one_picture_is_enough_with_a_known_hand(folder: Path, tmp_path: Path, c
     assert measure_errors(result["T_base_camera"], T_BASE_CAMERA)[0] < 3.0
 
 
-def test_cameras_that_see_a_sheet_on_the_table(folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_cameras_that_see_a_sheet_on_the_table(folder: Path, tmp_path: Path, cli: CommandLine, capsys: Capture) -> None:
     T_base_sheet: PoseTuple = ((0.0, -0.45, 0.0), quat_from_rotvec((0.0, 0.0, 0.3)))
     for number, name in enumerate(("front", "left")):
         (tmp_path / name).mkdir()
@@ -149,8 +151,7 @@ def test_cameras_that_see_a_sheet_on_the_table(folder: Path, tmp_path: Path, cap
     for number, name in enumerate(("front", "left")):
         true = compose(T_base_sheet, inverse(SEEN[number]))
         assert measure_errors(result["cameras"][name]["T_base_camera"], true)[0] < 2.0
-    assert main([*command]) == 0
-    assert "T_base_camera of left" in capsys.readouterr().out
+    assert "T_base_camera of left" in cli.run(*command)
 
 
 def test_unusable_pictures_are_one_line(folder: Path, tmp_path: Path, capsys: Capture) -> None:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from iris_session.cli.main import main
+from tests.cli.conftest import CommandLine
 
 
 @pytest.mark.parametrize("option", [("--drift", "30"), ("--bump-at", "20"), ("--glance-every", "5")])
-def test_options_for_unnamed_headsets_exclude_headset(
-    option: tuple[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["emulate", "127.0.0.1:1", "--headset", "name=ann", *option]) == 2
-    assert "model.drift_m_per_min" in capsys.readouterr().err
+def test_options_for_unnamed_headsets_exclude_headset(option: tuple[str, str], cli: CommandLine) -> None:
+    assert "model.drift_m_per_min" in cli.refuse("emulate", "127.0.0.1:1", "--headset", "name=ann", *option)

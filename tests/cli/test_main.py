@@ -19,6 +19,7 @@ from iris_session.cli.common import join_negative_poses
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.serve import make_session_config
 from iris_session.session.config import SessionConfig
+from tests.cli.conftest import CommandLine
 from tests.models import MENAGERIE
 
 
@@ -91,9 +92,9 @@ def test_invalid_command_line_exits_with_2(
         (["emulate", "--curve-server", "its.key", "--curve-key", "mine.key_secret"], "its.key"),
     ],
 )
-def test_expected_errors_are_one_line(arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(arguments) == 2
-    out, err = capsys.readouterr()
+def test_expected_errors_are_one_line(arguments: list[str], expected: str, cli: CommandLine) -> None:
+    cli.run(*arguments, status=2)
+    out, err = cli.out, cli.err
     assert out == ""
     (line,) = err.strip().splitlines()
     assert line.startswith("iris-session: ")
@@ -118,19 +119,17 @@ def test_serve_prints_json_and_its_recording_verifies(tmp_path: Path, capfd: pyt
     assert main(["verify", str(recording), str(tmp_path / "none.rrd")]) == 2
 
 
-def test_model_without_robots_says_what_a_robot_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_model_without_robots_says_what_a_robot_needs(tmp_path: Path, cli: CommandLine) -> None:
     scene = tmp_path / "ball.xml"
     scene.write_text("<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
-    assert main(["robots", str(scene)]) == 0
-    assert "3 actuated joints" in capsys.readouterr().err
+    cli.run("robots", scene)
+    assert "3 actuated joints" in cli.err
 
 
-def test_legs_are_listed_on_request(capsys: pytest.CaptureFixture[str]) -> None:
+def test_legs_are_listed_on_request(cli: CommandLine) -> None:
     scene = str(MENAGERIE / "unitree_go1" / "go1.xml")
-    assert main(["robots", scene, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["robots"] == []
-    assert main(["robots", scene, "--json", "--all"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    assert cli.json("robots", scene)["robots"] == []
+    found = cli.json("robots", scene, "--all")
     assert [robot["name"] for robot in found["robots"]] == ["FR_leg", "FL_leg", "RR_leg", "RL_leg"]
     assert found["notices"] == []
 
@@ -149,19 +148,18 @@ def test_options_of_a_session_reach_its_configuration() -> None:
     assert config.authority.unaligned == (*UNALIGNED, "operator", "key:abc")
 
 
-def test_verify_names_every_file_that_is_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_names_every_file_that_is_no_recording(tmp_path: Path, cli: CommandLine) -> None:
     files = [tmp_path / "monday" / "session.rrd", tmp_path / "tuesday" / "session.rrd"]
     for file in files:
         file.parent.mkdir()
         file.write_text("not a recording")
     for given in (files, [tmp_path]):
-        assert main(["verify", "--json", *map(str, given)]) == 2
-        out, err = capsys.readouterr()
+        cli.run("verify", "--json", *map(str, given), status=2)
+        out, err = cli.out, cli.err
         assert [one["path"] for one in json.loads(out)["files"]] == [str(file) for file in files]
         assert all(str(file) in err for file in files)
     (tmp_path / "empty").mkdir()
-    assert main(["verify", str(tmp_path / "empty")]) == 2
-    assert str(tmp_path / "empty") in capsys.readouterr().err
+    assert tmp_path / "empty" in cli.refuse("verify", tmp_path / "empty")
 
 
 def test_closed_pipe_ends_quietly(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:

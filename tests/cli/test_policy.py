@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from iris_session.cli import policy
 from iris_session.cli.common import CommandError
-from iris_session.cli.main import main
 from iris_session.cli.policy import LeRobotPolicy, RunLog, check_fit, drive, make_blank, name_inputs
+from tests.cli.conftest import CommandLine
 
 CAMERA = gymnasium.spaces.Box(0, 255, (8, 16, 3), np.uint8)
 
@@ -189,9 +189,10 @@ def test_without_lerobot_one_line_says_how(monkeypatch: pytest.MonkeyPatch) -> N
         LeRobotPolicy("me/act")
 
 
-def test_no_session_is_said_before_a_policy_is_loaded(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["policy", "--repo", "x", "--robot", "left", "--address", "127.0.0.1:1"]) == 2
-    assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
+def test_no_session_is_said_before_a_policy_is_loaded(cli: CommandLine) -> None:
+    assert "no session answers at 127.0.0.1:1" in cli.refuse(
+        "policy", "--repo", "x", "--robot", "left", "--address", "127.0.0.1:1"
+    )
 
 
 @pytest.mark.long

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from pathlib import Path
@@ -29,6 +28,7 @@ from iris_session.recording.summary import (
 )
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.assets import AssetsSummary
+from tests.cli.conftest import CommandLine
 from tests.recording.support import TICK_NS, journal, write
 from tests.recording.test_summary import write_session
 
@@ -101,21 +101,20 @@ def test_a_summary_is_lines_for_people() -> None:
     )
 
 
-def test_inspect_shows_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_shows_a_recording(tmp_path: Path, cli: CommandLine) -> None:
     path = write_session(tmp_path / "session.rrd")
-    assert main(["recording", "inspect", str(path)]) == 0
-    out, err = capsys.readouterr()
+    cli.run("recording", "inspect", path)
+    out, err = cli.out, cli.err
     assert err == ""
     assert "ann (operator, head, hand/left): 0.4 s, there at the end; held left for 0.4 s" in out
     assert "  damage     none" in out
     assert "  assets     none: made by an earlier version, or the session shared no scene" in out
-    assert main(["recording", "inspect", str(path), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = cli.json("recording", "inspect", path)
     assert sorted(result) == sorted(RecordingSummary.__struct_fields__)
     assert (result["ok"], result["steps"], result["people"][0]["held_s"]) == (True, 200, {"left": 0.358})
 
 
-def test_episodes_of_a_recording_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_episodes_of_a_recording_are_listed(tmp_path: Path, cli: CommandLine) -> None:
     header, batch = journal(20)
     running, over = (EpisodeChanged(1, state, "pour", "p1") for state in ("running", "success"))
     batch.events = [Event(1, 5, 6 * TICK_NS, running), Event(2, 15, 16 * TICK_NS, over)]
@@ -124,10 +123,8 @@ def test_episodes_of_a_recording_are_listed(tmp_path: Path, capsys: pytest.Captu
     writer.write_header(header)
     writer.add(batch)
     writer.close()
-    assert main(["recording", "episodes", str(path), "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
-    assert main(["recording", "inspect", str(path), "--json"]) == 0
-    (inspected,) = json.loads(capsys.readouterr().out)["episodes"]
+    shown = cli.json("recording", "episodes", path)
+    (inspected,) = cli.json("recording", "inspect", path)["episodes"]
     assert shown["episodes"][0].items() >= inspected.items()
     assert [one["verdict"] for one in shown["episodes"]] == ["success"]
     with Recording.open(path) as recording:
@@ -144,7 +141,7 @@ def test_episodes_of_a_recording_are_listed(tmp_path: Path, capsys: pytest.Captu
     assert (episode.label, episode.ended, episode.end_ns) == ("unknown", False, 20 * TICK_NS)
 
 
-def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, cli: CommandLine) -> None:
     for name in ("a/session.rrd", "b/session.part2.rrd", "b/session.part3.rrd", "b/session.resume2.rrd"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"no recording")
@@ -152,13 +149,12 @@ def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, capsys: pytest.C
     names = [path.relative_to(tmp_path).as_posix() for path in find_recordings(tmp_path, pytest.fail)]
     assert names == ["a/session.rrd", "b/session.resume2.rrd", "b/session.part2.rrd"]
     write(tmp_path / "a/session.rrd", *journal(20))
-    assert main(["recording", "inspect", str(tmp_path)]) == 1
-    out, err = capsys.readouterr()
+    cli.run("recording", "inspect", tmp_path, status=1)
+    out, err = cli.out, cli.err
     assert out.startswith(f"{tmp_path}/a/session.rrd  ")
     assert out.count("\n") == 1
     assert err.count("iris-session: ") == err.count("\n") == 2
-    assert main(["recording", "inspect", str(tmp_path), "--json"]) == 1
-    result = json.loads(capsys.readouterr().out)
+    result = cli.json("recording", "inspect", tmp_path, status=1)
     assert [row["ok"] for row in result["recordings"]] == [True, False, False]
     assert "not a Rerun file" in result["recordings"][1]["error"]
 
@@ -208,8 +204,7 @@ def test_text_of_a_file_controls_no_terminal(tmp_path: Path, capsys: pytest.Capt
     assert "\x1b" not in out + err
 
 
-def test_a_folder_without_recordings_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["recording", "inspect", str(tmp_path)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+def test_a_folder_without_recordings_is_one_line(tmp_path: Path, cli: CommandLine) -> None:
+    (line,) = cli.refuse("recording", "inspect", tmp_path).splitlines()
     assert line.startswith(f"iris-session: there is no recording below the folder {tmp_path}: give a .rrd file")
-    assert main(["recording", "inspect", "x" * 5000]) == 2
+    cli.run("recording", "inspect", "x" * 5000, status=2)

@@ -17,6 +17,7 @@ from PIL import ImageSequence
 from iris_session.cli.main import main
 from iris_session.recording import Recording
 from iris_session.replay.pictures import Image, PictureOptions, RecordingPictures, Timeline
+from tests.cli.conftest import CommandLine
 from tests.replay.support import Played, make_drawn_core, play, step_ns
 
 SIZE = ("--size", "160x120")
@@ -41,16 +42,13 @@ def draw(played: Played, times_ns: Sequence[int], camera: str = "operator") -> l
         return list(made.draw(times_ns))
 
 
-def test_a_video_holds_the_pictures_in_order(
-    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_video_holds_the_pictures_in_order(played: Played, tmp_path: Path, cli: CommandLine) -> None:
     out = tmp_path / "session.mp4"
     assert render(played.path, out, "--camera", "operator", "--fps", "100", "--json") == 0
-    shown = capsys.readouterr()
-    assert shown.err == ""
+    assert cli.err == ""
     begin_ns, end_ns = step_ns(0), step_ns(59)
     times = range(begin_ns, end_ns + 1, 10_000_000)
-    assert json.loads(shown.out) == {
+    assert json.loads(cli.out) == {
         "file": str(out),
         "pictures": len(times),
         "begin_s": times[0] * 1e-9,
@@ -73,16 +71,14 @@ def test_a_video_holds_the_pictures_in_order(
     assert os.listdir(tmp_path) == ["session.mp4"]
 
 
-def test_a_picture_is_exactly_what_was_drawn(
-    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_picture_is_exactly_what_was_drawn(played: Played, tmp_path: Path, cli: CommandLine) -> None:
     out = tmp_path / "one.png"
     assert render(played.path.parent, out, "--at", "0.1s", "--camera", "side") == 0
-    assert capsys.readouterr().out.startswith(f"{out}: the picture of 0.10 s, 160 x 120, PNG, ")
+    assert cli.out.startswith(f"{out}: the picture of 0.10 s, 160 x 120, PNG, ")
     (drawn,) = draw(played, [100_000_000], "side")
     assert cv2.imread(str(out))[..., ::-1].tobytes() == drawn.tobytes()
     assert render(played.path, out) == 2
-    assert capsys.readouterr().err == f"iris-session: {out} exists: give another file, or --force\n"
+    assert cli.err == f"iris-session: {out} exists: give another file, or --force\n"
     assert render(played.path, out, "--force") == 0
 
 
@@ -96,11 +92,9 @@ def test_an_animation_has_its_times(played: Played, tmp_path: Path) -> None:
         assert animation.info["loop"] == 0
 
 
-def test_cameras_are_listed(played: Played, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["recording", "render", str(played.path), "--list-cameras"]) == 0
-    assert capsys.readouterr().out == "operator\nside\n"
-    assert main(["recording", "render", str(played.path), "--list-cameras", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"cameras": ["operator", "side"]}
+def test_cameras_are_listed(played: Played, cli: CommandLine) -> None:
+    assert cli.run("recording", "render", played.path, "--list-cameras") == "operator\nside\n"
+    assert cli.json("recording", "render", played.path, "--list-cameras") == {"cameras": ["operator", "side"]}
 
 
 @pytest.mark.parametrize(
@@ -121,21 +115,21 @@ def test_cameras_are_listed(played: Played, capsys: pytest.CaptureFixture[str]) 
     ],
 )
 def test_what_cannot_be_drawn_is_one_line(
-    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str, options: Sequence[str], line: str
+    played: Played, tmp_path: Path, cli: CommandLine, out: str, options: Sequence[str], line: str
 ) -> None:
     assert render(played.path, tmp_path / out, *options) == 2
-    err = capsys.readouterr().err
+    err = cli.err
     assert err.endswith(f"{line}\n")
     assert err.count("\n") == 1
     assert not os.listdir(tmp_path)
 
 
-def test_damage_is_said_and_is_a_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damage_is_said_and_is_a_status(tmp_path: Path, cli: CommandLine) -> None:
     gap = play(tmp_path / "session.rrd", 45, core=make_drawn_core())
     del gap.batch.rows[30]
     path = gap.write()
     assert render(path, tmp_path / "x.mp4", "--fps", "100") == 1
-    assert capsys.readouterr().err == f"iris-session: {path} is damaged: steps 30 to 39 are left out\n"
+    assert cli.err == f"iris-session: {path} is damaged: steps 30 to 39 are left out\n"
     assert (tmp_path / "x.mp4").stat().st_size > 0
 
 

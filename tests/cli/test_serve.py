@@ -12,6 +12,7 @@ from iris_session.cli.main import build_parser, main
 from iris_session.cli.scene import find_scene_file
 from iris_session.protocol.errors import IrisError
 from iris_session.session.config import DEFAULT_SHEET_M, SessionConfig
+from tests.cli.conftest import CommandLine
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 ARM = '<robot name="arm"><link name="base"><visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>'
@@ -96,13 +97,8 @@ def test_invalid_scale_is_rejected(given: str, part: Path, capsys: pytest.Captur
     "option",
     [("--robots", "robots.toml"), ("--assign", "ann=left"), ("--mode", "request")],
 )
-def test_robot_options_are_rejected_for_shown_files(
-    option: tuple[str, str], part: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["serve", str(part), *option, *QUIET]) == 2
-    error = capsys.readouterr().err
-    assert f"{option[0]}: {part.name} has no robots" in error
-    assert error.count("\n") == 1
+def test_robot_options_are_rejected_for_shown_files(option: tuple[str, str], part: Path, cli: CommandLine) -> None:
+    assert f"{option[0]}: {part.name} has no robots" in cli.refuse("serve", part, *option, *QUIET)
 
 
 def test_package_dir_is_used(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -139,10 +135,9 @@ def test_file_replaces_the_anchors_of_the_scene(tmp_path: Path) -> None:
     assert set(plain.anchors) == {"table"}
 
 
-def test_example_file_is_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_example_file_is_valid(tmp_path: Path, cli: CommandLine) -> None:
     for words in ([], ["arms4"]):
-        assert main(["anchors", "example", *words]) == 0
-        text = capsys.readouterr().out
+        text = cli.run("anchors", "example", *words)
         path = tmp_path / "example.toml"
         path.write_text(text)
         arguments = build_parser().parse_args(["serve", "arms4", "--no-record", "--anchors", str(path)])
@@ -151,8 +146,7 @@ def test_example_file_is_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert config.sheet_sizes() == {"table": DEFAULT_SHEET_M}
     own = serve.create_session(build_parser().parse_args(["serve", "arms4", "--no-record"])).config
     assert config.anchors == own.anchors, "that of the scene"
-    assert main(["anchors", "example", "arms4", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"toml": text}
+    assert cli.json("anchors", "example", "arms4") == {"toml": text}
 
 
 def test_resumed_session_gets_new_anchors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

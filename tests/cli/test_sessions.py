@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import pytest
 
 from iris_session.cli.common import CommandError
-from iris_session.cli.main import build_parser, main
+from iris_session.cli.main import build_parser
 from iris_session.cli.serve import make_session_config
 from iris_session.client import FoundSession
 from iris_session.security import KeyHome, KeyPair, compute_fingerprint, decode_key
+from tests.cli.conftest import CommandLine
 
 KEY = KeyPair.generate().public
 PLAIN = FoundSession("handover", "127.0.0.1:7721", "s1", "live", "", ("127.0.0.1:7721",))
@@ -29,27 +29,23 @@ def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[FoundSession]
     return found
 
 
-def test_sessions_are_listed_with_known_keys(found: list[FoundSession], capsys: pytest.CaptureFixture[str]) -> None:
+def test_sessions_are_listed_with_known_keys(found: list[FoundSession], cli: CommandLine) -> None:
     KeyHome().known_servers.pin("10.0.0.6:7721", "lab-2", KEY)
     found += [PLAIN, NEW, KNOWN]
-    assert main(["sessions"]) == 0
-    plain, new, known = capsys.readouterr().out.splitlines()
+    plain, new, known = cli.run("sessions").splitlines()
     assert plain.split()[:3] == ["handover", "127.0.0.1:7721", "live"]
     assert "not encrypted" in plain
     assert "(new: join" in new
     assert known.split()[:3] == ["lab-2", "10.0.0.6:7721", "replay"]
     assert "(new" not in known
-    assert main(["sessions", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["sessions"]
+    rows = cli.json("sessions")["sessions"]
     assert [(row["encrypted"], row["known"]) for row in rows] == [(False, False), (True, False), (True, True)]
     assert rows[1]["addresses"] == ["10.0.0.5:7721", "10.1.0.5:7721"]
 
 
-def test_empty_network_exits_with_1_and_advice(found: list[FoundSession], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sessions"]) == 1
-    assert "type the address" in capsys.readouterr().out
-    assert main(["sessions", "--json"]) == 1
-    assert json.loads(capsys.readouterr().out) == {"ok": False, "sessions": []}
+def test_empty_network_exits_with_1_and_advice(found: list[FoundSession], cli: CommandLine) -> None:
+    assert "type the address" in cli.run("sessions", status=1)
+    assert cli.json("sessions", status=1) == {"ok": False, "sessions": []}
 
 
 def options(*words: str) -> argparse.Namespace:
@@ -108,7 +104,7 @@ def test_assets_of_recordings() -> None:
         options("--record-assets", "some")
 
 
-def test_budget_of_recordings(capsys: pytest.CaptureFixture[str]) -> None:
+def test_budget_of_recordings(cli: CommandLine) -> None:
     for text, n_bytes in (("20GB", 20 * 10**9), ("1.5 GiB", 3 << 29), ("16mb", 16 * 10**6)):
         assert make_session_config(options("--record-budget", text), "x").record_budget_bytes == n_bytes
     assert make_session_config(options(), "x").record_budget_bytes == 0
@@ -116,6 +112,6 @@ def test_budget_of_recordings(capsys: pytest.CaptureFixture[str]) -> None:
         with pytest.raises(SystemExit) as ended:
             options(f"--record-budget={text}")
         assert ended.value.code == 2
-        assert "is not a size for a recording: give 16MB or more, for example 20GB" in capsys.readouterr().err
+        assert "is not a size for a recording: give 16MB or more, for example 20GB" in cli.err
     with pytest.raises(CommandError, match="leave --no-record out"):
         make_session_config(options("--no-record", "--record-budget", "1GB"), "x")
