@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from tests.anchors.worlds import shifted, tracking_frame
 from tests.cli.conftest import CommandLine
 from tests.recording.headsets import Played
 
-Capture = pytest.CaptureFixture[str]
 TRUE: dict[str, PoseTuple] = {
     "table": ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0)),
     "door": ((1.2, 0.1, 0.3), (0.7071067811865476, 0.0, 0.0, 0.7071067811865476)),
@@ -61,13 +59,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return play().write(tmp_path_factory.mktemp("solve") / "session.rrd")
 
 
-def solve(cli: CommandLine, *words: str) -> dict[str, Any]:
-    result: dict[str, Any] = cli.json("anchors", "solve", *words)
-    return result
-
-
-def test_alignments_are_solved_again_and_compared(recording: Path, capsys: Capture) -> None:
-    result = solve(capsys, str(recording))
+def test_alignments_are_solved_again_and_compared(recording: Path, cli: CommandLine) -> None:
+    result = cli.json("anchors", "solve", recording)
     ann, bob, carl = result["participants"]
     for person in (ann, bob):
         (outlier,) = person["frames"][0]["outliers"]
@@ -88,17 +81,17 @@ def test_alignments_are_solved_again_and_compared(recording: Path, capsys: Captu
     assert not bob["frames"][0]["alignments"][0]["beyond"]
 
 
-def test_true_anchor_poses_can_be_given(recording: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_true_anchor_poses_can_be_given(recording: Path, tmp_path: Path, cli: CommandLine) -> None:
     path = tmp_path / "true.toml"
     path.write_text(Constellation("table", TRUE, {}, {"table": 0.16}).to_toml())
-    result = solve(capsys, str(recording), "--anchors", str(path))
+    result = cli.json("anchors", "solve", recording, "--anchors", path)
     assert [one["frames"][0]["outliers"] for one in result["participants"][:2]] == [[], []]
     assert result["constellation"]["moved"] == []
 
 
-def test_relative_sheet_poses_and_moved_sheet(recording: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_relative_sheet_poses_and_moved_sheet(recording: Path, tmp_path: Path, cli: CommandLine) -> None:
     out = tmp_path / "anchors.toml"
-    result = solve(capsys, str(recording), "--out", str(out))
+    result = cli.json("anchors", "solve", recording, "--out", out)
     (moved,) = result["constellation"]["moved"]
     assert moved["anchor_id"] == "shelf"
     assert moved["distance_m"] == pytest.approx(0.03, abs=0.008)
@@ -130,12 +123,12 @@ def test_moved_anchor_is_used_at_its_pose_of_the_time(tmp_path: Path) -> None:
     assert distance(after.T_world_tracking[0], (x + 0.5, y, z)) < 1e-6
 
 
-def test_unusable_observations_are_counted(tmp_path: Path, capsys: Capture) -> None:
+def test_unusable_observations_are_counted(tmp_path: Path, cli: CommandLine) -> None:
     played, T = Played({"table": TRUE["table"]}, {"table": 0.12}), frames()[0]
     played.join(1, "p1", "ann")
     played.look(1, "table", TRUE["table"], T, 1, n=6)
     played.look(1, "door", TRUE["door"], T, 2, n=5)
-    result = solve(capsys, str(played.write(tmp_path / "session.rrd")))
+    result = cli.json("anchors", "solve", str(played.write(tmp_path / "session.rrd")))
     (frame,) = result["participants"][0]["frames"]
     assert frame["refused"]
     assert "160 mm, not 120 mm" in frame["advice"]

@@ -9,7 +9,7 @@ import re
 import pytest
 
 from iris_session.cli.bench import BENCHMARKS, Range
-from iris_session.cli.main import main
+from tests.cli.conftest import CommandLine
 
 
 @pytest.mark.parametrize(
@@ -22,13 +22,8 @@ from iris_session.cli.main import main
         (["cloud-stream", "--hz", "0"], "give 1 to 120"),
     ],
 )
-def test_numbers_that_cannot_be_measured_are_refused(
-    options: list[str], text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["bench", *options])
-    assert ended.value.code == 2
-    assert text in capsys.readouterr().err
+def test_numbers_that_cannot_be_measured_are_refused(options: list[str], text: str, cli: CommandLine) -> None:
+    assert text in cli.refuse("bench", *options)
 
 
 @pytest.mark.parametrize(
@@ -39,13 +34,8 @@ def test_numbers_that_cannot_be_measured_are_refused(
         (["deformable", "--vertices", "120"], 1, "choose 100 or 121"),
     ],
 )
-def test_unusable_options_are_one_line(
-    options: list[str], status: int, text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["bench", *options]) == status
-    error = capsys.readouterr().err
-    assert text in error
-    assert error.count("\n") == 1
+def test_unusable_options_are_one_line(options: list[str], status: int, text: str, cli: CommandLine) -> None:
+    assert text in cli.refuse("bench", *options, status=status)
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
@@ -58,10 +48,7 @@ def test_every_benchmark_has_the_options_and_defaults_that_it_takes(name: str) -
     assert {option: one.default if isinstance(one, Range) else one for option, one in options} == taken
 
 
-def test_help_of_one_benchmark_has_its_own_options(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["bench", "stop", "--help"])
-    shown = set(re.findall(r"--[a-z-]+", capsys.readouterr().out))
+def test_help_of_one_benchmark_has_its_own_options(cli: CommandLine) -> None:
+    shown = set(re.findall(r"--[a-z-]+", cli.run("bench", "stop", "--help")))
     assert shown == {"--help", "--seconds", "--check", "--json"}
-    with pytest.raises(SystemExit):
-        main(["bench", "stop", "--clients", "4"])
+    cli.refuse("bench", "stop", "--clients", "4")

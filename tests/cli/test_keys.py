@@ -15,7 +15,6 @@ import pytest
 from zmq.auth import create_certificates
 
 from iris_session.cli.common import CommandError, check_session_reachable, describe_error, describe_own_sessions
-from iris_session.cli.main import main
 from iris_session.client import RefusedError
 from iris_session.client.discovery import Address
 from iris_session.doctor.runner import LOCAL, find_default_address
@@ -25,8 +24,6 @@ from iris_session.protocol.server_messages import Refused
 from iris_session.security import KeyHome, KeyPair, RegisteredSession
 from iris_session.web.certificate import find_certificate, load_or_make_certificate
 from tests.cli.conftest import CommandLine
-
-Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture
@@ -135,24 +132,22 @@ def test_pair_web_shows_a_link_that_works_behind_the_gateway(home: KeyHome, cli:
     assert "assumed at port 7735: give --web-port" in cli.err
 
 
-def find_page_port(capsys: Capture, *options: str) -> int | None:
-    assert main(["pair", "--web", "--no-wait", "--json", "--address", "192.168.0.10:7731", *options]) == 0
-    shown = capsys.readouterr()
-    assert "assumed" not in shown.err
-    return urlsplit(json.loads(shown.out)["page"]).port
+def find_page_port(cli: CommandLine, *options: str) -> int | None:
+    page = cli.json("pair", "--web", "--no-wait", "--address", "192.168.0.10:7731", *options)["page"]
+    assert "assumed" not in cli.err
+    return urlsplit(page).port
 
 
-def test_pair_web_has_the_port_of_a_session_that_runs_here(home: KeyHome, cli: CommandLine, capsys: Capture) -> None:
+def test_pair_web_has_the_port_of_a_session_that_runs_here(home: KeyHome, cli: CommandLine) -> None:
     mark = home.load_server_key().fingerprint
     home.sessions.add(RegisteredSession("s0", "lab-0", os.getpid(), ("10.0.0.5",), 7721, mark, 7725))
-    assert find_page_port(capsys, "--web-port", "9001") == 9001
+    assert find_page_port(cli, "--web-port", "9001") == 9001
     home.sessions.add(RegisteredSession("s1", "lab-1", os.getpid(), ("10.0.0.5",), 7731, mark, 8443))
-    assert find_page_port(capsys) == 8443
-    assert find_page_port(capsys, "--web-port", "9001") == 9001
+    assert find_page_port(cli) == 8443
+    assert find_page_port(cli, "--web-port", "9001") == 9001
     home.sessions.add(RegisteredSession("s1", "lab-1", os.getpid(), ("10.0.0.5",), 7731, mark, 0))
-    assert main(["pair", "--web", "--no-wait", "--address", "192.168.0.10:7731"]) != 0
-    assert "serves no page" in capsys.readouterr().err
-    assert main(["pair", "--no-wait", "--json"]) != 0, "two sessions"
+    assert "serves no page" in cli.refuse("pair", "--web", "--no-wait", "--address", "192.168.0.10:7731")
+    assert "2 sessions run here" in cli.refuse("pair", "--no-wait")
     assert cli.json("pair", "--no-wait", "--session", "lab-1")["page"] == "", "no link to a page that is not served"
 
 

@@ -11,9 +11,8 @@ import sys
 import msgspec
 import pytest
 
-from iris_session.cli.live import TerminalView, _render_table, describe_episode, format_event
+from iris_session.cli.live import TerminalView, _render_table, describe_episode, format_event, main
 from iris_session.protocol.server_messages import EpisodeChanged, Event, MarkerAdded, SamplesRejected
-from tests.cli.conftest import CommandLine
 
 STATUS = {
     "session_time_s": 12.3,
@@ -49,11 +48,14 @@ def test_table_shows_participants_and_why_nothing_moves() -> None:
     assert "NaN in QPOS at DOF 3" in text
 
 
-def test_display_prints_events_and_ignores_truncated_lines(monkeypatch: pytest.MonkeyPatch, cli: CommandLine) -> None:
+def test_display_prints_events_and_ignores_truncated_lines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     lines = '{"status": {}, "events": ["one"]}\n{"status": {}, "ev\n{"status": {}, "events": ["two"]}\n'
     monkeypatch.setattr(sys, "stdin", io.StringIO(lines))
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    assert cli.run(*"title").split() == ["one", "two"]
+    assert main("title") == 0
+    assert capsys.readouterr().out.split() == ["one", "two"]
 
 
 def test_episode_has_a_line_that_says_what_to_do() -> None:

@@ -52,9 +52,6 @@ def test_every_command_has_help_for_its_options_and_valid_examples(name: str) ->
     [
         ([], "required: COMMAND, one of demo, serve"),
         (["fly"], "fly"),
-        (["serve", "--seconds", "nan"], "nan"),
-        (["serve", "handover", "--record", "a.txt"], "'a.txt': a recording is one file: give a name that ends in .rrd"),
-        (["serve", "handover", "--record", "a.rrd", "--no-record"], "--no-record: not allowed with argument --record"),
         (["policy", "--repo", "x", "--robot", "left", "--hz", "0"], "give 1 to 240"),
         (["view", "--port", "70000"], "'70000' is not a port"),
         (["pair", "--web-port", "70000"], "'70000' is not a port"),
@@ -82,9 +79,6 @@ def test_invalid_command_line_exits_with_2(
         (["verify", "nothing.rrd"], "nothing.rrd"),
         (["robots", "nothing"], "expected one of handover, arm, arms, panda, aloha"),
         (["serve", "arms13"], "1 to 12 arms, not 13"),
-        (["serve", "handover", "--assign", "ann"], "NAME=ROBOT[,ROBOT]"),
-        (["serve", "handover", "--unaligned", "ann"], "key:FINGERPRINT"),
-        (["serve", "handover", "--assign", "ann=left", "--assignment", "nearest"], "--assignment config"),
         (["serve", "handover", "--assign", "ann=elbow", "--control-port", "0", "--state-port", "0"], "left"),
         (["emulate", "--behaviour", "foo"], "giver, receiver, folder, stower, wander, idle, observer"),
         (["emulate", "--behaviour", "giver"], "needs a partner"),
@@ -159,7 +153,7 @@ def test_verify_names_every_file_that_is_no_recording(tmp_path: Path, cli: Comma
         assert [one["path"] for one in json.loads(out)["files"]] == [str(file) for file in files]
         assert all(str(file) in err for file in files)
     (tmp_path / "empty").mkdir()
-    assert tmp_path / "empty" in cli.refuse("verify", tmp_path / "empty")
+    assert str(tmp_path / "empty") in cli.refuse("verify", tmp_path / "empty")
 
 
 def test_closed_pipe_ends_quietly(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:

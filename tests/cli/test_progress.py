@@ -8,10 +8,11 @@ import pytest
 
 from iris_session.cli import progress
 from iris_session.cli.progress import LINE_PERIOD_S, ProgressLine
-from tests.cli.conftest import CommandLine
 
 
-def test_a_file_gets_a_whole_line_now_and_then(monkeypatch: pytest.MonkeyPatch, cli: CommandLine) -> None:
+def test_a_file_gets_a_whole_line_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     now_s = 100.0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now_s)
     with ProgressLine(Path("session.rrd")) as line:
@@ -20,4 +21,4 @@ def test_a_file_gets_a_whole_line_now_and_then(monkeypatch: pytest.MonkeyPatch, 
         line.show("step 2 of 3")
         now_s += LINE_PERIOD_S / 2
         line.show("step 3 of 3", at_once=True)
-    assert cli.err == "session.rrd: step 2 of 3\n", "short work says nothing, no control characters"
+    assert capsys.readouterr().err == "session.rrd: step 2 of 3\n", "short work says nothing, no control characters"

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import pytest
 import trimesh
 
-from iris_session.cli.main import main
 from tests.cli.conftest import CommandLine
 from tests.scene.arm import write_arm
 from tests.scene.importers.test_gltf import furniture
-
-
-def run(*arguments: object) -> int:
-    return main([str(argument) for argument in arguments])
 
 
 def test_inspect_of_an_arm(tmp_path: Path, cli: CommandLine) -> None:
@@ -34,7 +28,7 @@ def test_export_of_files_and_models(tmp_path: Path, cli: CommandLine) -> None:
     names = ("box.stl", "model.xml", "other.mjcf")
     for source in (*(tmp_path / name for name in names), furniture(tmp_path / "furniture.glb")):
         out = tmp_path / f"{source.stem}_out.glb"
-        assert out in cli.run("scene", "export", source, out, "--assets", tmp_path / "assets")
+        assert str(out) in cli.run("scene", "export", source, out, "--assets", tmp_path / "assets")
         extents = sorted(trimesh.load_scene(out).extents)
         if source.stem != "furniture":
             assert extents == pytest.approx([1, 2, 3], abs=1e-6)
@@ -84,18 +78,14 @@ def test_millimetres_are_suspected_in_robots_and_models(tmp_path: Path, cli: Com
         )
 
 
-def test_collision_shapes_are_drawn_by_the_option_that_the_advice_names(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arm, assets = tmp_path / "arm.urdf", ("--assets", tmp_path / "assets", "--json")
+def test_collision_shapes_are_drawn_by_the_option_that_the_advice_names(tmp_path: Path, cli: CommandLine) -> None:
+    arm, assets = tmp_path / "arm.urdf", ("--assets", tmp_path / "assets")
     shape = '<collision><geometry><sphere radius="0.1"/></geometry></collision>'
     arm.write_text(f'<robot name="arm"><link name="base">{shape}</link></robot>')
-    assert run("scene", "inspect", arm, *assets) == 0
-    (skipped,) = json.loads(capsys.readouterr().out)["skipped"]
+    (skipped,) = cli.json("scene", "inspect", arm, *assets)["skipped"]
     (option,) = re.findall(r"--\w+", skipped)
-    assert run("scene", "inspect", arm, *assets, option) == 0
-    assert json.loads(capsys.readouterr().out)["skipped"] == []
-    assert run("scene", "inspect", "arm", *assets, option) != 0
+    assert cli.json("scene", "inspect", arm, *assets, option)["skipped"] == []
+    cli.refuse("scene", "inspect", "arm", *assets, option)
 
 
 def test_export_does_not_overwrite_input(tmp_path: Path, cli: CommandLine) -> None:
@@ -123,11 +113,8 @@ def test_export_does_not_overwrite_input(tmp_path: Path, cli: CommandLine) -> No
     ],
 )
 def test_invalid_files_are_one_line_errors(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, content: bytes | None, text: str
+    tmp_path: Path, cli: CommandLine, name: str, content: bytes | None, text: str
 ) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
-    assert run("scene", "inspect", tmp_path / name, "--assets", tmp_path / "assets") != 0
-    error = capsys.readouterr().err
-    assert text in error
-    assert error.count("\n") == 1
+    assert text in cli.refuse("scene", "inspect", tmp_path / name, "--assets", tmp_path / "assets")
