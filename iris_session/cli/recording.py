@@ -4,9 +4,8 @@ and `repair`. The other actions have modules of their own. `view` and `verify` a
 from __future__ import annotations
 
 import argparse
-import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     )
     from iris_session.rrd.assets import AssetsSummary
 
-SUFFIX: Final = ".rrd"
 _CLASSES: Final = {
     "closed": "closed: `verify` re-simulates authority, control and physics",
     "open": "open: `verify` re-simulates authority and control, physics is taken from the file",
@@ -91,57 +89,37 @@ def register(commands: Commands) -> None:
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
-    """Print the summary of a recording, or a line for each of a folder."""
-    path: Path = arguments.path
-    if not os.path.exists(path):
-        raise CommandError(f"{path} does not exist: give a recording (session{SUFFIX}), or a folder with recordings")
-    with ending_as_interrupts():
-        if path.is_dir():
-            return _inspect_folder(path, as_json=arguments.json)
-        summary = _summarise_file(path)
-    return print_result(arguments, summary, format_summary(summary), ok=summary.ok)
-
-
-def _inspect_folder(folder: Path, *, as_json: bool) -> int:
-    """Print a line for every recording below a folder. One that cannot be read does not hide the others."""
+    """Print the summary of a recording, or a line for each of a folder. One that is unreadable hides no other."""
     import msgspec
 
-    from iris_session.recording import RecordingError
-    from iris_session.recording.folders import find_recordings
-
-    rows: list[dict[str, object]] = []
-
-    def refuse(path: str, why: str) -> None:
-        rows.append({"path": path, "ok": False, "error": why})
-        print_error(why)
-
-    files = find_recordings(folder, lambda error: refuse(str(error.filename), str(error)))
-    if not files and not rows:
-        raise CommandError(
-            f"there is no recording below the folder {folder}: give a {SUFFIX} file that `serve` or `demo` wrote, or a "
-            "folder with such files"
-        )
-    for file in files:
-        try:
-            summary = _summarise_file(file)
-        except RecordingError as error:
-            refuse(str(file), str(error))
-            continue
-        rows.append(msgspec.to_builtins(summary))
-        if not as_json:
-            print(to_printable(format_line(summary)), flush=True)
-    ok = all(row["ok"] for row in rows)
-    if as_json:
-        print_json({"ok": ok, "recordings": rows})
-    return 0 if ok else 1
-
-
-def _summarise_file(path: Path) -> RecordingSummary:
-    from iris_session.recording import Recording
+    from iris_session.dataset.episodes import list_files
+    from iris_session.recording import Recording, RecordingError
     from iris_session.recording.summary import summarise
 
-    with ReadingProgress(path) as progress, Recording.open(path, warn=False) as recording:
-        return summarise(recording, progress.show_steps)
+    def summarise_file(path: Path) -> RecordingSummary:
+        with ReadingProgress(path) as progress, Recording.open(path, warn=False) as recording:
+            return summarise(recording, progress.show_steps)
+
+    files = list_files([arguments.path])
+    with ending_as_interrupts():
+        if not arguments.path.is_dir():
+            summary = summarise_file(arguments.path)
+            return print_result(arguments, summary, format_summary(summary), ok=summary.ok)
+        rows: list[dict[str, object]] = []
+        for file in files:
+            try:
+                summary = summarise_file(file)
+            except RecordingError as error:
+                rows.append({"path": str(file), "ok": False, "error": str(error)})
+                print_error(str(error))
+                continue
+            rows.append(msgspec.to_builtins(summary))
+            if not arguments.json:
+                print(to_printable(format_line(summary)), flush=True)
+    ok = all(row["ok"] for row in rows)
+    if arguments.json:
+        print_json({"ok": ok, "recordings": rows})
+    return 0 if ok else 1
 
 
 def format_line(summary: RecordingSummary) -> str:
@@ -366,21 +344,18 @@ def _register_verify(commands: Commands) -> None:
 
 def run_verify(arguments: argparse.Namespace) -> int:
     """Verify each file; the first problem of each is named with its step and entry."""
+    from iris_session.dataset.episodes import list_files
     from iris_session.recording import Problem, RecordingError, VerifyReport
     from iris_session.session.verification import verify_recording
 
     reports: list[VerifyReport] = []
-
-    def refuse(path: str, why: str) -> None:  # must not hide the others
-        reports.append(VerifyReport(path, problems=[Problem(-1, "unreadable", "file", why)]))
-        print_error(why)
-
-    for path in list_files(arguments.files, lambda error: refuse(str(error.filename), str(error))):
+    for path in list_files(arguments.files):
         try:
             with ending_as_interrupts(), ReadingProgress(path) as progress:
                 report = verify_recording(path, progress.show_steps)
-        except RecordingError as error:
-            refuse(str(path), str(error))
+        except RecordingError as error:  # it hides no other
+            reports.append(VerifyReport(str(path), problems=[Problem(-1, "unreadable", "file", str(error))]))
+            print_error(str(error))
             continue
         if not arguments.json:
             print(to_printable(f"{path}: {report.line()}"))
@@ -390,16 +365,3 @@ def run_verify(arguments: argparse.Namespace) -> int:
         print_json({"ok": ok, "files": [report.as_dict() for report in reports]})
     unreadable = all(p.kind == "unreadable" and p.step < 0 for report in reports for p in report.problems)
     return 0 if ok else 2 if unreadable else 1
-
-
-def list_files(given: Sequence[Path], on_error: Callable[[OSError], None]) -> list[Path]:
-    """Return the recordings to verify: in place of a folder, all in and below it; `CommandError` if there is none."""
-    from iris_session.recording.folders import find_recordings
-
-    files: list[Path] = []
-    for path in given:
-        found = find_recordings(path, on_error) if path.is_dir() else [path]
-        if not found:
-            raise CommandError(f"there is no recording below the folder {path}: give a .rrd that `serve` wrote")
-        files += found
-    return files

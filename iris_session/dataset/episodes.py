@@ -132,7 +132,7 @@ def list_files(given: Sequence[Path]) -> list[Path]:
 
     files: dict[str, Path] = {}
     for path in given:
-        if not path.exists():
+        if not os.path.exists(path):
             raise DatasetError(f"{path} does not exist: give a recording (session.rrd), or a folder with recordings")
         found = find_recordings(path, refuse) if path.is_dir() else [path]
         if not found:

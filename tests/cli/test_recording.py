@@ -204,7 +204,7 @@ def test_text_of_a_file_controls_no_terminal(tmp_path: Path, capsys: pytest.Capt
     assert "\x1b" not in out + err
 
 
-def test_a_folder_without_recordings_is_one_line(tmp_path: Path, cli: CommandLine) -> None:
-    (line,) = cli.refuse("recording", "inspect", tmp_path).splitlines()
-    assert line.startswith(f"iris-session: there is no recording below the folder {tmp_path}: give a .rrd file")
-    cli.run("recording", "inspect", "x" * 5000, status=2)
+def test_what_is_no_recording_is_one_line(tmp_path: Path, cli: CommandLine) -> None:
+    text = f"iris-session: there is no recording below the folder {tmp_path}: give one with .rrd files"
+    assert cli.refuse("recording", "inspect", tmp_path).startswith(text)
+    assert "does not exist" in cli.refuse("recording", "inspect", "x" * 5000)
