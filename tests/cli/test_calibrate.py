@@ -165,11 +165,6 @@ def test_invalid_poses_are_rejected(text: str, error: str, tmp_path: Path, cli: 
     assert error in cli.refuse(*CALIBRATE, tmp_path, *SMALL_SHEET, "--poses", tmp_path / "poses.csv")
 
 
-@pytest.mark.parametrize("given", ["table=0,0,0", "table=0,0,0,2,0,0,0", "0,0,0,1,0,0,0"])
-def test_pose_on_the_command_line_is_checked(given: str, cli: CommandLine) -> None:
-    assert "argument --at" in cli.refuse(*CALIBRATE, "pictures", *SMALL_SHEET, "--at", given)
-
-
 # --- cloud calibrate --------------------------------------------------------------------------------------------------
 
 CAMERA = CameraModel(640, 480, 585.0, 585.0, 319.5, 239.5)

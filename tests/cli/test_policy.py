@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from iris_session.cli import policy
 from iris_session.cli.common import CommandError
 from iris_session.cli.policy import LeRobotPolicy, RunLog, check_fit, drive, make_blank, name_inputs
-from tests.cli.conftest import CommandLine
 
 CAMERA = gymnasium.spaces.Box(0, 255, (8, 16, 3), np.uint8)
 
@@ -187,12 +186,6 @@ def test_without_lerobot_one_line_says_how(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(CommandError, match="pip install lerobot"):
         LeRobotPolicy("me/act")
-
-
-def test_no_session_is_said_before_a_policy_is_loaded(cli: CommandLine) -> None:
-    assert "no session answers at 127.0.0.1:1" in cli.refuse(
-        "policy", "--repo", "x", "--robot", "left", "--address", "127.0.0.1:1"
-    )
 
 
 @pytest.mark.long

@@ -14,8 +14,7 @@ from iris_session.cli.common import MOST_LINES
 from iris_session.cli.main import INTERRUPTED, main
 from iris_session.cli.recording import format_line, format_summary
 from iris_session.protocol.server_messages import EpisodeChanged, Event
-from iris_session.recording import Recording, parts
-from iris_session.recording.folders import find_recordings
+from iris_session.recording import parts
 from iris_session.recording.summary import (
     AlignmentSummary,
     DropSummary,
@@ -103,9 +102,8 @@ def test_a_summary_is_lines_for_people() -> None:
 
 def test_inspect_shows_a_recording(tmp_path: Path, cli: CommandLine) -> None:
     path = write_session(tmp_path / "session.rrd")
-    cli.run("recording", "inspect", path)
-    out, err = cli.out, cli.err
-    assert err == ""
+    out = cli.run("recording", "inspect", path)
+    assert cli.err == ""
     assert "ann (operator, head, hand/left): 0.4 s, there at the end; held left for 0.4 s" in out
     assert "  damage     none" in out
     assert "  assets     none: made by an earlier version, or the session shared no scene" in out
@@ -127,18 +125,6 @@ def test_episodes_of_a_recording_are_listed(tmp_path: Path, cli: CommandLine) ->
     (inspected,) = cli.json("recording", "inspect", path)["episodes"]
     assert shown["episodes"][0].items() >= inspected.items()
     assert [one["verdict"] for one in shown["episodes"]] == ["success"]
-    with Recording.open(path) as recording:
-        (episode,) = recording.episodes
-    assert (episode.label, episode.text, episode.start_ns) == ("success", "pour", 6 * TICK_NS)
-    batch.events = [Event(1, 5, 6 * TICK_NS, running)]
-    path = tmp_path / "cut.rrd"
-    writer = RrdWriter(path, "id")
-    writer.write_header(header)
-    writer.add(batch)
-    writer.close()
-    with Recording.open(path) as recording:
-        (episode,) = recording.episodes
-    assert (episode.label, episode.ended, episode.end_ns) == ("unknown", False, 20 * TICK_NS)
 
 
 def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, cli: CommandLine) -> None:
@@ -146,14 +132,10 @@ def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, cli: CommandLine
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"no recording")
     (tmp_path / "notes.txt").write_text("none either")
-    names = [path.relative_to(tmp_path).as_posix() for path in find_recordings(tmp_path, pytest.fail)]
-    assert names == ["a/session.rrd", "b/session.resume2.rrd", "b/session.part2.rrd"]
     write(tmp_path / "a/session.rrd", *journal(20))
-    cli.run("recording", "inspect", tmp_path, status=1)
-    out, err = cli.out, cli.err
-    assert out.startswith(f"{tmp_path}/a/session.rrd  ")
-    assert out.count("\n") == 1
-    assert err.count("iris-session: ") == err.count("\n") == 2
+    (line,) = cli.run("recording", "inspect", tmp_path, status=1).splitlines()
+    assert line.startswith(f"{tmp_path}/a/session.rrd  ")
+    assert cli.err.count("iris-session: ") == cli.err.count("\n") == 2
     result = cli.json("recording", "inspect", tmp_path, status=1)
     assert [row["ok"] for row in result["recordings"]] == [True, False, False]
     assert "not a Rerun file" in result["recordings"][1]["error"]

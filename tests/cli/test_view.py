@@ -39,19 +39,13 @@ def test_newest_session_of_a_folder_is_chosen(
         shutil.copy(closed, tmp_path / name)
         os.utime(tmp_path / name, (1e9 + i, 1e9 + i))
     monkeypatch.chdir(tmp_path)
-    cli.run("view", "--no-open")
-    out, err = cli.out, cli.err
-    lines = out.splitlines()
+    lines = cli.run("view", "--no-open").splitlines()
+    assert cli.err == ""
     assert lines[0] == "3 sessions below sessions, the newest is shown; the others:"
     assert [line.split()[-1] for line in lines[1:3]] == ["sessions/c/session.rrd", "sessions/a/session.rrd"]
     assert lines[3] == "shows session.rrd, session.resume2.rrd of sessions/b"
     assert lines[4].startswith("made the copy sessions/b/session.view.rrd (")
-    assert err == ""
-    assert (
-        cli.run("view", "sessions/b", "--no-open")
-        .splitlines()[1]
-        .startswith("uses the copy sessions/b/session.view.rrd (")
-    )
+    assert "\nuses the copy sessions/b/session.view.rrd (" in cli.run("view", "sessions/b", "--no-open")
 
 
 def test_recording_that_is_being_written_is_found_among_resumed_ones(path: Path, cli: CommandLine) -> None:
@@ -78,16 +72,12 @@ def test_damage_is_named(path: Path, cli: CommandLine) -> None:
 def test_unusable_input_is_one_line(tmp_path: Path, cli: CommandLine) -> None:
     (tmp_path / "other.rrd").write_bytes(b"x" * 99)
     (tmp_path / "empty").mkdir()
-    for arguments, why in (
-        ((str(tmp_path / "no.rrd"),), "does not exist: give a recording"),
-        ((str(tmp_path / "empty"),), "there is no recording below the folder"),
-        ((str(tmp_path / "other.rrd"),), "not a Rerun file"),
+    for name, why in (
+        ("no.rrd", "does not exist: give a recording"),
+        ("empty", "there is no recording below the folder"),
+        ("other.rrd", "not a Rerun file"),
     ):
-        cli.run("view", *arguments, status=2)
-        out, err = cli.out, cli.err
-        assert out == ""
-        assert err.count("\n") == 1
-        assert why in err
+        assert why in cli.refuse("view", tmp_path / name)
 
 
 def test_port_of_another_program_is_refused(path: Path, cli: CommandLine) -> None:
@@ -113,11 +103,10 @@ def test_viewer_that_fails_is_a_line(
 
 def test_repair_says_what_is_lost(path: Path, tmp_path: Path, cli: CommandLine) -> None:
     output = tmp_path / "repaired.rrd"
-    cli.run("recording", "repair", path, "-o", output)
-    out, err = cli.out, cli.err
+    out = cli.run("recording", "repair", path, "-o", output)
     assert out.startswith(f"{output}: 40 steps, 0.1 s, ")
     assert "  lost    nothing" in out
-    assert err == ""
+    assert cli.err == ""
     assert "--force" in cli.refuse("recording", "repair", path, "-o", output)
     victim = scan_file(path).messages[-10]
     data = bytearray(path.read_bytes())
