@@ -11,20 +11,20 @@ from iris_session.cli.main import main
 
 
 class CommandLine:
-    """Runs commands in this process and checks their exit status. `out`, `err`: what the last one printed."""
+    """Runs commands and checks their exit status. `out`, `err`: what the last one and its processes printed."""
 
-    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
-        self._capsys = capsys
+    def __init__(self, capfd: pytest.CaptureFixture[str]) -> None:
+        self._capfd = capfd
         self.out = self.err = ""
 
     def run(self, *words: object, status: int = 0) -> str:
         """Run a command and return its standard output."""
-        self._capsys.readouterr()
+        self._capfd.readouterr()
         try:
             found = main([*map(str, words)])
         except SystemExit as ended:  # of the parser
             found = int(ended.code or 0)
-        self.out, self.err = self._capsys.readouterr()
+        self.out, self.err = self._capfd.readouterr()
         assert found == status, self.err
         return self.out
 
@@ -42,5 +42,5 @@ class CommandLine:
 
 
 @pytest.fixture
-def cli(capsys: pytest.CaptureFixture[str]) -> CommandLine:
-    return CommandLine(capsys)
+def cli(capfd: pytest.CaptureFixture[str]) -> CommandLine:
+    return CommandLine(capfd)

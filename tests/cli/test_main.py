@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import shlex
@@ -88,22 +87,17 @@ def test_unusable_command_lines_are_one_line(words: str, text: str, cli: Command
     assert text in cli.refuse(*shlex.split(words))
 
 
-def test_serve_prints_json_and_its_recording_verifies(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_serve_prints_json_and_its_recording_verifies(tmp_path: Path, cli: CommandLine) -> None:
     recording = tmp_path / "session.rrd"
-    ports = ["--control-port", "0", "--state-port", "0", "--record", str(recording)]
-    assert main(["serve", "handover", "--seconds", "0.3", "--json", *ports]) == 0
-    result = json.loads(capfd.readouterr().out)
-    assert result["ok"] is True
-    assert result["recording"] == str(recording)
+    ports = ("--control-port", 0, "--state-port", 0)
+    result = cli.json("serve", "handover", "--seconds", "0.3", *ports, "--record", recording)
+    assert (result["ok"], result["recording"]) == (True, str(recording))
     assert result["tick"] > 0
     assert {"ticks", "late", "late_share", "p99_ms"} <= set(result["lateness"])
-    assert main(["verify", str(recording)]) == 0
-    assert capfd.readouterr().out.startswith(f"{recording}: ok: ")
-    assert main(["verify", "--json", str(recording)]) == 0
-    report = json.loads(capfd.readouterr().out)
-    assert report["ok"] is True
-    assert report["files"][0]["steps"] == result["tick"]
-    assert main(["verify", str(recording), str(tmp_path / "none.rrd")]) == 2
+    assert cli.run("verify", recording).startswith(f"{recording}: ok: ")
+    report = cli.json("verify", recording)
+    assert (report["ok"], report["files"][0]["steps"]) == (True, result["tick"])
+    assert "none.rrd" in cli.refuse("verify", recording, tmp_path / "none.rrd")
 
 
 def test_model_without_robots_says_what_a_robot_needs(tmp_path: Path, cli: CommandLine) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.e2e.session_process import FREE_PORTS, run_command, run_in_process, wait_until
+from tests.cli.conftest import CommandLine
+from tests.e2e.session_process import FREE_PORTS, run_command, wait_until
 
 #: An arm with two actuators on one joint.
 UNCLEAR = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
@@ -64,16 +65,10 @@ def folder(tmp_path: Path) -> Path:
     ],
 )
 def test_invalid_input_is_one_line_that_names_the_value(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], expected: str
+    folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], expected: str, cli: CommandLine
 ) -> None:
     monkeypatch.chdir(folder)
-    status, out, errors = run_in_process("serve", *arguments)
-    assert status == 2, (out, errors)
-    lines = errors.strip().splitlines()
-    assert len(lines) == 1, errors
-    assert lines[0].startswith("iris-session: ")
-    assert expected.lower() in lines[0].lower()
-    assert not out.strip()
+    assert expected.lower() in cli.refuse("serve", *arguments).lower()
     assert_no_process_in(folder)
 
 
