@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from iris_session.client import Client
     from iris_session.demo.named_scenes import NamedScene
     from iris_session.protocol.server_messages import ParticipantInfo
+    from iris_session.security import RegisteredSession
 
 N = TypeVar("N", int, float)
 Commands: TypeAlias = "argparse._SubParsersAction[CommandParser]"
@@ -128,6 +129,10 @@ class CommandParser(argparse.ArgumentParser):
     notes = ""
     examples: Sequence[str] = ()
 
+    def __init__(self, **options: Any) -> None:
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **options)
+        self._negative_number_matcher = re.compile(r"-[0-9.][^,]*(,.*)?")  # a pose that begins with a minus, too
+
     def list_examples(self) -> Sequence[str]:
         """Return the examples of its help."""
         lists = (action.choices.values() for action in self._actions if isinstance(action, argparse._SubParsersAction))
@@ -189,9 +194,7 @@ def add_actions(
 
 
 def _add_parser(commands: Commands, name: str, help: str, description: str) -> CommandParser:
-    form = argparse.RawDescriptionHelpFormatter
-    description = description or f"{help[0].upper()}{help[1:]}."
-    return commands.add_parser(name, help=help, description=description, formatter_class=form)
+    return commands.add_parser(name, help=help, description=description or f"{help[0].upper()}{help[1:]}.")
 
 
 def add_json_option(parser: argparse._ActionsContainer) -> None:
@@ -263,26 +266,24 @@ def find_participant(client: Client, name: str) -> ParticipantInfo:
     raise CommandError(to_printable(f"no participant {name!r} in the session; there are: {others}"))
 
 
-def describe_own_sessions() -> str:
-    """Return the addresses of this user's encrypted sessions, for errors of commands without an address."""
+def _read_own_sessions() -> Sequence[RegisteredSession]:
+    """Return the encrypted sessions of this user that run here."""
     from iris_session.security import KeyHome, KeysError
 
-    try:
-        notes = KeyHome().sessions.read()
-    except KeysError:
-        notes = []
-    yours = (f"; your session {one.name!r} is at {one.hosts[0]}:{one.control}" for one in notes if one.hosts)
+    with suppress(KeysError):
+        return KeyHome().sessions.read()
+    return ()
+
+
+def describe_own_sessions() -> str:
+    """Return the addresses of this user's encrypted sessions, for errors of commands without an address."""
+    yours = (f"; your session {x.name!r} is at {x.hosts[0]}:{x.control}" for x in _read_own_sessions() if x.hosts)
     return "".join(yours) or "; for a session on another machine, give its address or --session NAME"
 
 
 def describe_error(error: IrisError) -> str:
     """Return an error as a line: of a key that is not on the list, with what the owner of a session here does."""
-    from iris_session.security import KeyHome, KeysError
-
-    try:
-        owns = getattr(error, "code", "") == RefusalCode.UNPAIRED and bool(KeyHome().sessions.read())
-    except KeysError:
-        owns = False
+    owns = getattr(error, "code", "") == RefusalCode.UNPAIRED and _read_own_sessions()
     return f"{error}{'; if the session is your own: `iris-session keys allow me`' if owns else ''}"
 
 
@@ -467,10 +468,6 @@ def report_damage(path: Path, problems: Sequence[str]) -> int:
     return 1 if problems else 0
 
 
-#: Comma-separated numbers, the first negative: no option has this form.
-_BEGINS_WITH_MINUS: Final = re.compile(r"-[0-9.][^,]*(,[^,]*)+")
-
-
 def parse_pose(text: str) -> PoseTuple:
     """Parse a pose: position [m] and unit quaternion, w first."""
     try:
@@ -483,17 +480,6 @@ def parse_pose(text: str) -> PoseTuple:
         )
     x, y, z, *q = numbers
     return (x, y, z), quat_normalize((q[0], q[1], q[2], q[3]))
-
-
-def join_negative_poses(arguments: Sequence[str]) -> list[str]:
-    """Join a pose that begins with a minus to its option, as `--pose=-1,...`: argparse would read it as an option."""
-    out: list[str] = []
-    for word in arguments:
-        if _BEGINS_WITH_MINUS.fullmatch(word) and out and out[-1].startswith("--") and "=" not in out[-1]:
-            out[-1] += f"={word}"
-        else:
-            out.append(word)
-    return out
 
 
 def add_pose_option(parser: argparse.ArgumentParser, description: str) -> None:

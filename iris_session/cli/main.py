@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
 import signal
@@ -29,7 +28,7 @@ from iris_session.cli import (
     view,
     web,
 )
-from iris_session.cli.common import CommandError, CommandParser, describe_error, join_negative_poses, print_error
+from iris_session.cli.common import CommandError, CommandParser, describe_error, print_error
 from iris_session.protocol.errors import IrisError
 from iris_session.system.extras import describe_import_error
 from iris_session.system.log import LEVEL_VARIABLE, configure_logging
@@ -46,7 +45,6 @@ def build_parser() -> CommandParser:
     parser = CommandParser(
         prog="iris-session",
         description="Share one robot scene between several people in XR headsets.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"iris-session {version('iris-session')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -68,7 +66,7 @@ def _run_command(argv: list[str] | None) -> int:
     session_log = logging.getLogger("iris_session.session")
     try:
         configure_logging()
-        arguments = build_parser().parse_args(join_negative_poses(sys.argv[1:] if argv is None else argv))
+        arguments = build_parser().parse_args(argv)
         os.environ.setdefault("MUJOCO_GL", "disable")  # MuJoCo need not load OpenGL: what draws loads it by itself
         if LEVEL_VARIABLE not in os.environ:
             # `serve` and `demo` show restarts, gaps and overruns as events. The log would repeat them, from the thread

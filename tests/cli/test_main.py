@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from iris_session.authority.config import UNALIGNED
-from iris_session.cli.common import join_negative_poses
 from iris_session.cli.main import build_parser, main
 from iris_session.cli.serve import make_session_config
 from iris_session.session.config import SessionConfig
@@ -41,7 +40,7 @@ def test_every_command_has_help_for_its_options_and_valid_examples(name: str) ->
     assert examples
     for example in examples:
         words = shlex.split(re.split(r" {2,}| >", example)[0])[1:]  # the rest is a comment, or a file
-        PARSERS["iris-session"].parse_args(join_negative_poses(words))
+        PARSERS["iris-session"].parse_args(words)
     silent = [action.option_strings for action in PARSERS[name]._actions if action.option_strings and not action.help]
     assert silent == []
 
