@@ -188,44 +188,35 @@ def _find_addresses(
 ) -> tuple[str, list[tuple[str, int]], int]:
     """Return the session's name, hosts and ports at which others reach it, best first, and the page's port or 0."""
     from iris_session.client.discovery import Address
+    from iris_session.web.config import WEB_FROM_CONTROL
 
     here = [note for note in home.sessions.read() if note.server == key.fingerprint]
     found = [note for note in here if arguments.session in ("", note.name)]
     if arguments.address:
         address = Address.parse(arguments.address)
-        same = [note for note in found if note.control == address.port]
-        web = _find_web_port(arguments, same[0]) if same else _guess_web_port(arguments, address.port)
-        return arguments.session, [(address.host, address.port)], web
-    if len(found) != 1:
+        name, places = arguments.session, [(address.host, address.port)]
+        found = [note for note in found if note.control == address.port]
+    elif len(found) == 1:
+        name, places = found[0].name, [(host, found[0].control) for host in found[0].hosts]
+    else:
         raise CommandError(_format_session_choice(arguments.session, here, found))
-    return found[0].name, [(host, found[0].control) for host in found[0].hosts], _find_web_port(arguments, found[0])
-
-
-def _find_web_port(arguments: argparse.Namespace, note: RegisteredSession) -> int:
-    """Return the port of the page of a session on this machine, 0 for none."""
-    port = int(arguments.web_port or note.web)
-    if _needs_web(arguments) and not port:
+    note = found[0] if found else None
+    control = places[0][1]
+    web = int(arguments.web_port or (control + WEB_FROM_CONTROL if note is None else note.web))
+    if not _needs_web(arguments):
+        pass
+    elif note is None and arguments.web_port is None:
+        print_error(
+            f"no session with control port {control} runs here, so the page is assumed at port {web}: give --web-port "
+            "if it has another one"
+        )
+    elif note is not None and not web:
         raise CommandError(
             f"session {note.name!r} serves no page: pip install 'iris-session[web]' there, or leave out --no-web"
         )
-    if _needs_web(arguments) and note.web and port != note.web:
-        print_error(f"session {note.name!r} serves its page at port {note.web}, not {port}")
-    return port
-
-
-def _guess_web_port(arguments: argparse.Namespace, control_port: int) -> int:
-    """Return the port of the page of a session that does not run here: the usual one, unless it was given."""
-    from iris_session.web.config import WEB_FROM_CONTROL
-
-    if arguments.web_port is not None:
-        return int(arguments.web_port)
-    port = control_port + WEB_FROM_CONTROL
-    if _needs_web(arguments):
-        print_error(
-            f"no session with control port {control_port} runs here, so the page is assumed at port {port}: give "
-            "--web-port if it has another one"
-        )
-    return port
+    elif note is not None and note.web not in (0, web):
+        print_error(f"session {note.name!r} serves its page at port {note.web}, not {web}")
+    return name, places, web
 
 
 def _format_session_choice(name: str, here: list[RegisteredSession], found: list[RegisteredSession]) -> str:
@@ -284,12 +275,10 @@ def _wait_until_used(home: KeyHome, made: JoinCode, arguments: argparse.Namespac
     entry = None if now is None else now.paired
     if entry is not None and entry.fingerprint in home.clients.read():
         result = {"paired": entry.name, "fingerprint": entry.fingerprint, "roles": entry.roles}
-        print_result(arguments, result, [f"paired: {entry.name} ({entry.fingerprint})"])
-        return 0
+        return print_result(arguments, result, [f"paired: {entry.name} ({entry.fingerprint})"])
     reason = "expired"
     if now is not None and now.attempts_left == 0:
         reason = "void"
     elif now is not None and (entry is not None or (not now.secret and time.time() < now.expires)):
         reason = "not_listed"
-    print_result(arguments, {"paired": None, "reason": reason}, [FAILURE_TEXTS[reason]])
-    return 1
+    return print_result(arguments, {"paired": None, "reason": reason}, [FAILURE_TEXTS[reason]], ok=False)

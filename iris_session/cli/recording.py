@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final
 
 from iris_session.cli import recording_episodes, recording_export, recording_render, view
 from iris_session.cli.common import (
-    CommandError,
     Commands,
     add_actions,
     add_command,
@@ -298,8 +297,6 @@ def run_repair(arguments: argparse.Namespace) -> int:
     from iris_session.recording.repair import repair
 
     path: Path = arguments.path
-    if not path.exists():
-        raise CommandError(f"{path} does not exist: give a recording (session.rrd), or its folder")
     with ending_as_interrupts(), ReadingProgress(path) as progress:
         report = repair(path, arguments.out, overwrite=arguments.force, progress=progress.show_bytes)
     return print_result(arguments, report, format_repair(report), ok=report.ok)

@@ -217,7 +217,10 @@ def _parse_scene(arguments: argparse.Namespace) -> tuple[_ParsedScene, AssetStor
     check_file_options(arguments, path)
     try:
         store = AssetStore(arguments.assets)
-        return _parse_model(arguments.scene, store) if path is None else _compose_file(path, arguments, store), store
+        if path is None:
+            return _parse_model(arguments.scene, store), store
+        made = make_builder(path, path.stem, arguments).build(store)
+        return _ParsedScene(made.spec, made.scene_hash, made.skipped, made.notes), store
     except OSError as error:
         raise CommandError(f"assets cannot be stored: {error} (choose another folder with --assets DIR)") from None
 
@@ -231,11 +234,6 @@ def _parse_model(scene: str, store: AssetStore) -> _ParsedScene:
     # The initial state of a session: the keyframe `home`, if there is one.
     parsed = parse_mujoco(model, store, data=World(model, (), ()).make_initial_data(), name=Path(scene).stem)
     return _ParsedScene(parsed.spec, parsed.scene_hash, parsed.skipped, check_model_units(parsed.spec))
-
-
-def _compose_file(path: Path, arguments: argparse.Namespace, store: AssetStore) -> _ParsedScene:
-    made = make_builder(path, path.stem, arguments).build(store)
-    return _ParsedScene(made.spec, made.scene_hash, made.skipped, made.notes)
 
 
 def _format_size(n_bytes: int) -> str:

@@ -189,7 +189,7 @@ def _wait_until_open(port: int, process: subprocess.Popen[bytes]) -> None:
     deadline = time.monotonic() + START_S
     while not _is_open(port):
         if (status := process.poll()) is not None:
-            raise CommandError(f"Rerun's viewer ended with exit status {status}: its messages are above", 1)
+            raise _make_viewer_error(status)
         if time.monotonic() > deadline:
             raise CommandError(f"Rerun's viewer did not listen on port {port} within {START_S:g} s", 1)
         time.sleep(POLL_S)
@@ -240,8 +240,12 @@ def _wait(process: subprocess.Popen[bytes]) -> int:
     except KeyboardInterrupt:
         return 0
     if status:
-        raise CommandError(f"Rerun's viewer ended with exit status {status}: its messages are above", 1)
+        raise _make_viewer_error(status)
     return 0
+
+
+def _make_viewer_error(status: int) -> CommandError:
+    return CommandError(f"Rerun's viewer ended with exit status {status}: its messages are above", 1)
 
 
 @contextmanager
@@ -251,15 +255,14 @@ def _started(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 
     # In a group of its own, so that Ctrl-C reaches this process alone, which then ends it in order.
     process = subprocess.Popen(command, env=make_environment(), process_group=0, stdin=subprocess.DEVNULL)
-    try:
-        yield process
-    finally:
-        process.terminate()
+    with process:
         try:
-            process.wait(END_S)
-        except subprocess.TimeoutExpired:
+            yield process
+        finally:
+            process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(END_S)
             process.kill()
-            process.wait()
 
 
 def _find_free_port() -> int:
