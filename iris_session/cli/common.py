@@ -226,7 +226,7 @@ def check_session_reachable(arguments: argparse.Namespace) -> None:
         return
     address = Address.parse(arguments.address or LOCAL_ADDRESS)
     try:
-        socket.create_connection((address.host, address.port), timeout=2.0).close()
+        socket.create_connection((address.host, address.port), 2.0).close()  # [s]
     except OSError as error:
         raise CommandError(
             f"no session answers at {address}: is `iris-session serve` running there? "

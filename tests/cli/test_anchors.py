@@ -29,8 +29,6 @@ from iris_session.protocol.status import (
 )
 from tests.cli.conftest import CommandLine
 
-Capture = pytest.CaptureFixture[str]
-
 # --- print ------------------------------------------------------------------------------------------------------------
 
 
