@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from anchors.sheet import Sheet
     from iris_session.client import Client
     from iris_session.protocol.server_messages import ParticipantInfo
-    from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
+    from iris_session.protocol.status import CrossCheckReport, ParticipantReport, StatusReport
 
 #: Edge of the code with marks where none is given: it must be smaller than the default sheet to fit on A4.
 MARKED_SHEET_M: Final = 0.140
@@ -430,11 +430,13 @@ def _format_headset(p: ParticipantReport) -> Iterator[str]:
     kind = p.alignment + (" + offset" if r.offset else "") + ("" if r.running else " STOPPED")
     aligned = p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED, *AlignmentKind.VIEW_ONLY)
     stated = aligned and p.alignment != AlignmentKind.PLACED and not r.offset
+    is_pending = r.pending_m > 0.0 or r.pending_rad > 0.0  # not yet in force
+    correction = f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go" if is_pending else "-"
     at = [f"{m * 1e3:.1f} mm" if stated else "-" for m in (r.error_at_anchor_m, r.error_at_robot_m)]
     yield (
         f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_age(p.alignment_age_ns) if aligned else '-':>6s} "
         f"{at[0]:>9s} {at[1]:>9s} {r.observations:6d} {r.viewpoints:6d} {degrees(r.residual_tilt_rad):4.1f} deg  "
-        f"{format_pending_correction(r)}"
+        f"{correction}"
     )
     if r.doubt:
         yield f"    UNCONFIRMED ({r.doubt}): begins no engagement until a look at a sheet"
@@ -453,13 +455,6 @@ def _format_headset(p: ParticipantReport) -> Iterator[str]:
         yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {format_age(r.alarm_ns)} ago"
     if r.advice:
         yield f"    advice: {r.advice}"
-
-
-def format_pending_correction(r: AlignmentReport) -> str:
-    """Return the rest of a correction that is not yet in force."""
-    if not (r.pending_m > 0.0 or r.pending_rad > 0.0):
-        return "-"
-    return f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go"
 
 
 def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:

@@ -426,16 +426,11 @@ def _print_check(arguments: argparse.Namespace, settings: CloudSettings, placed:
 
 
 def _find_known_sheets(arguments: argparse.Namespace) -> KnownSheets:
-    """Return the sheets of the options, or those of the session."""
+    """Return the sheets of the options; without `--at` also the anchors of the session, where it joins as observer."""
     sheets = make_sheets(arguments.sheet)
-    if not arguments.at:
-        return _ask_session(arguments, sheets)
-    _check_known_sheets(arguments.at, sheets)
-    return KnownSheets(sheets, dict(arguments.at), {})
-
-
-def _ask_session(arguments: argparse.Namespace, sheets: list[Sheet]) -> KnownSheets:
-    """Join as an observer for the poses and sizes of the anchors. `sheets`: further ones, at unknown poses."""
+    if arguments.at:
+        _check_known_sheets(arguments.at, sheets)
+        return KnownSheets(sheets, dict(arguments.at), {})
     with make_client(arguments, "observer", "cloud calibrate") as client:
         client.wait_for(lambda one: one.mirror.synced, 5.0)
         anchors = [one for one in client.mirror.anchors.values() if one.size_m > 0.0]
@@ -494,7 +489,8 @@ def calibrate(
     placed = {}
     for one in taken:
         name = one.settings.name
-        T, covariance = pose_to_matrix(_read_pose(cameras[name]["T_base_camera"])), covariances[name]
+        pose, covariance = cameras[name]["T_base_camera"], covariances[name]
+        T = pose_to_matrix((tuple(pose["position_m"]), tuple(pose["quaternion_wxyz"])))
         points = _make_points(settings, one, T)
         error_m = math.hypot(compute_points_error(covariance, T, points), sheet_m)
         cameras[name]["error_mm_p95"] = 1e3 * error_m
@@ -562,11 +558,6 @@ def _fit_cameras(cameras: dict[str, Any], placed: Mapping[str, PlacedCamera], sh
             "condition": one.condition,
         }
     return {"reference": first, "cameras": found}
-
-
-def _read_pose(value: dict[str, list[float]]) -> PoseTuple:
-    (x, y, z), (w, i, j, k) = value["position_m"], value["quaternion_wxyz"]
-    return (x, y, z), (w, i, j, k)
 
 
 def _format_icp(result: dict[str, Any]) -> Iterator[str]:

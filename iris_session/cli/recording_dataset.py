@@ -14,7 +14,7 @@ from iris_session.cli.recording_render import parse_size
 from iris_session.dataset.formats import FORMATS
 
 if TYPE_CHECKING:
-    from iris_session.dataset.run import DatasetReport
+    pass
 
 LABELS: Final = ("success", "failure", "unknown")
 #: Options that only data sets have.
@@ -99,11 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
     ):
         files = list_files(arguments.paths)
         report = export_dataset(files, arguments.out, arguments.to, options, progress.show, open_pool)
-    print_result(arguments, report, _format(report))
-    return 1 if report.left_out else 0
-
-
-def _format(report: DatasetReport) -> list[str]:
     n = f"{report.episodes:,} episode{'' if report.episodes == 1 else 's'}"
     lines = [f"{report.folder}: {n}, {report.frames:,} frames, {report.format}"]
-    return [*lines, *(f"  {line}" for line in (*list_first(report.left_out), *list_first(report.notes)))]
+    lines += [f"  {line}" for line in (*list_first(report.left_out), *list_first(report.notes))]
+    return print_result(arguments, report, lines, ok=not report.left_out)

@@ -16,6 +16,7 @@ from iris_session.cli.common import (
     add_json_option,
     ending_as_interrupts,
     parse_free_port,
+    pick_attributes,
     print_error,
     print_json,
     to_printable,
@@ -117,7 +118,10 @@ def run(arguments: argparse.Namespace) -> int:
 
             return serve_page(found, cameras, arguments.port, opens=not arguments.no_open)
     if arguments.json:
-        print_json(_to_json(found))
+        recordings = [pick_attributes(one, "path", "id", "session_name", "problems") for one in found]
+        episodes = [_to_row(one) for listed in found for one in listed.episodes]
+        ok = not any(one.problems for one in found)
+        print_json({"ok": ok, "episodes": episodes, "recordings": recordings})
     elif arguments.csv:
         _print_csv(found)
     return 1 if any(one.problems for one in found) else 0
@@ -187,14 +191,6 @@ def _to_row(one: ListedEpisode) -> dict[str, Any]:
     import msgspec
 
     return {**msgspec.to_builtins(one), "final_verdict": one.final_verdict}
-
-
-def _to_json(found: Sequence[ListedRecording]) -> dict[str, Any]:
-    recordings = [
-        {"path": one.path, "id": one.id, "session_name": one.session_name, "problems": one.problems} for one in found
-    ]
-    episodes = [_to_row(one) for listed in found for one in listed.episodes]
-    return {"ok": not any(one.problems for one in found), "episodes": episodes, "recordings": recordings}
 
 
 def _print_csv(found: Sequence[ListedRecording]) -> None:

@@ -188,6 +188,8 @@ def _draw(pictures: RecordingPictures, times_ns: Sequence[int], progress: Progre
 
 def _write(out: Path, arguments: argparse.Namespace, images: Iterator[Image], n_images: int) -> str:
     """Write the file, as a whole or not at all. Return the name of its codec."""
+    import cv2
+
     kind = out.suffix.lower()
     with writing(out), Replacement(out, permissions=None, suffix=kind) as replacement:
         if kind == VIDEO:
@@ -195,7 +197,8 @@ def _write(out: Path, arguments: argparse.Namespace, images: Iterator[Image], n_
         if kind == ANIMATION:
             _write_animation(replacement.file, list(images), round(1000 / arguments.fps))
             return "GIF"
-        _write_picture(replacement.file, next(images))
+        _, data = cv2.imencode(PICTURE, next(images)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        replacement.file.write(data.tobytes())
         return "PNG"
 
 
@@ -241,10 +244,3 @@ def _write_animation(file: BinaryIO, images: Sequence[Image], frame_ms: int) -> 
     palette = frames[len(frames) // 2].quantize(colors=200)
     frames = [frame.quantize(palette=palette, dither=Pillow.Dither.NONE) for frame in frames]
     frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=frame_ms, loop=0, optimize=True)
-
-
-def _write_picture(file: BinaryIO, image: Image) -> None:
-    import cv2
-
-    _, data = cv2.imencode(PICTURE, image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    file.write(data.tobytes())
