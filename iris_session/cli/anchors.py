@@ -81,12 +81,8 @@ def _register_print(actions: Commands) -> None:
     )
     one.add_argument("--size", type=parse_length, metavar="LENGTH", help="edge of the QR code (150mm; --marks: 140mm)")
     one.add_argument("--marks", action="store_true", help="four crosses around the frame; a4 holds sizes up to 142mm")
-    one.add_argument(
-        "--measured",
-        type=parse_length,
-        metavar="LENGTH",
-        help="edge of the printed code by a ruler: print the lines for the anchors file, write no sheet",
-    )
+    text = "edge of the printed code by a ruler: print the lines for the anchors file, write no sheet"
+    one.add_argument("--measured", type=parse_length, metavar="LENGTH", help=text)
     _add_layout_option(one)
     one.add_argument("--id", default="table", metavar="NAME", help="id of the anchor (%(default)s)")
     one.add_argument("--paper", default="a4", metavar="PAPER", help="a5, a4, a3, a2, letter or tabloid (%(default)s)")
@@ -112,13 +108,8 @@ def _register_example(actions: Commands) -> None:
 
 
 def _add_layout_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--layout",
-        type=int,
-        choices=(1, 2),
-        default=2,
-        help="2: with the white around the code that headsets ask for; 1: as printed before",
-    )
+    text = "2: with the white around the code that headsets ask for; 1: as printed before"
+    parser.add_argument("--layout", type=int, choices=(1, 2), default=2, help=text)
 
 
 def _register_status(actions: Commands) -> None:
@@ -154,13 +145,8 @@ def _register_align(actions: Commands) -> None:
         """,
     )
     one.add_argument("what", choices=sorted(AlignAction.ALL))
-    one.add_argument(
-        "participant",
-        nargs="?",
-        default=ALL_PARTICIPANTS,
-        metavar="PARTICIPANT",
-        help="name or id, or `all` (%(default)s)",
-    )
+    text = "name or id, or `all` (%(default)s)"
+    one.add_argument("participant", nargs="?", default=ALL_PARTICIPANTS, metavar="PARTICIPANT", help=text)
     add_address_options(one, option=True)
 
 

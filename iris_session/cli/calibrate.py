@@ -164,23 +164,17 @@ def register_camera(actions: Commands) -> None:
     )
     one.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the pictures")
     _add_sheet_options(one, is_required=True, at="known pose of a sheet, T_base_sheet; repeatable")
-    one.add_argument(
-        "--intrinsics",
-        type=Path,
-        metavar="FILE",
-        help="TOML with width, height, fx, fy, cx, cy, distortion, or a 3x3 matrix as text "
-        "(default: intrinsics.toml or intrinsics.txt beside the pictures)",
+    text = (
+        "TOML with width, height, fx, fy, cx, cy, distortion, or a 3x3 matrix as text "
+        "(default: intrinsics.toml or intrinsics.txt beside the pictures)"
     )
+    one.add_argument("--intrinsics", type=Path, metavar="FILE", help=text)
     one.add_argument("--poses", type=Path, metavar="CSV", help="T_base_ee, pose of the robot's hand, per picture")
     one.add_argument(
         "--camera-on-hand", action="store_true", help="with --poses: the camera is on the hand, the sheet does not move"
     )
-    one.add_argument(
-        "--in-hand",
-        type=parse_pose,
-        metavar="X,Y,Z,QW,QX,QY,QZ",
-        help="with --poses: known pose of the sheet on the hand, T_ee_sheet; one picture is enough",
-    )
+    text = "with --poses: known pose of the sheet on the hand, T_ee_sheet; one picture is enough"
+    one.add_argument("--in-hand", type=parse_pose, metavar="X,Y,Z,QW,QX,QY,QZ", help=text)
     one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
 
 

@@ -294,79 +294,47 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("session")
     group.add_argument("--name", help="name of the session (default: that of the scene)")
     group.add_argument("--host", metavar="ADDR", help="address to listen on, 0.0.0.0 for all (default: 127.0.0.1)")
-    group.add_argument(
-        "--interface",
-        dest="interfaces",
-        action="append",
-        metavar="NAME_OR_ADDR",
-        help="network to listen on instead of --host: a name like eth0, or an address; repeatable",
-    )
+    text = "network to listen on instead of --host: a name like eth0, or an address; repeatable"
+    group.add_argument("--interface", dest="interfaces", action="append", metavar="NAME_OR_ADDR", help=text)
     group.add_argument("--advertise", metavar="ADDR", help="address for clients, if a router forwards our ports")
-    group.add_argument(
-        "--port-base",
-        type=parse_port_base,
-        metavar="N",
-        help="block of ports: introduction N, control N+1, state N+2, ... N+6 (default: 7720)",
-    )
+    text = "block of ports: introduction N, control N+1, state N+2, ... N+6 (default: 7720)"
+    group.add_argument("--port-base", type=parse_port_base, metavar="N", help=text)
     no_beacon = "do not announce the session on the network"
     group.add_argument("--no-beacon", dest="beacon_port", action="store_const", const=0, help=no_beacon)
     group.add_argument("--control-port", type=int, metavar="PORT", help="0: any free port")
     group.add_argument("--state-port", type=int, metavar="PORT", help="0: any free port")
     group.add_argument("--curve", action="store_true", help="encrypt on loopback too, and admit listed keys only")
-    group.add_argument(
-        "--curve-key",
-        metavar="FILE",
-        help="secret key of the session for encryption, a ZeroMQ certificate *.key_secret that only you can read "
-        "(default: your own, made on first use; `iris-session keys show` has its fingerprint)",
+    text = (
+        "secret key of the session for encryption, a ZeroMQ certificate *.key_secret that only you can read "
+        "(default: your own, made on first use; `iris-session keys show` has its fingerprint)"
     )
+    group.add_argument("--curve-key", metavar="FILE", help=text)
     record = group.add_mutually_exclusive_group()
     record.add_argument(
         "--record", type=parse_recording_name, metavar="FILE", help="path of the recording (default: below sessions/)"
     )
     record.add_argument("--no-record", dest="record", action="store_const", const=False, help="record nothing")
-    group.add_argument(
-        "--record-clouds",
-        dest="record_clouds_hz",
-        type=parse_cloud_rate,
-        metavar="RATE",
-        help="frames per second of each point cloud and picture in the recording, or off (default: 2Hz)",
+    text = "frames per second of each point cloud and picture in the recording, or off (default: 2Hz)"
+    group.add_argument("--record-clouds", dest="record_clouds_hz", type=parse_cloud_rate, metavar="RATE", help=text)
+    text = (
+        "what of the scenes goes into the recording: what the best level of detail needs (scene), all levels, or "
+        "nothing (default: scene)"
     )
-    group.add_argument(
-        "--record-assets",
-        choices=("none", "scene", "all"),
-        help="what of the scenes goes into the recording: what the best level of detail needs (scene), all levels, or "
-        "nothing (default: scene)",
+    group.add_argument("--record-assets", choices=("none", "scene", "all"), help=text)
+    text = "size that the recording may have, such as 20GB; the session goes on without one then (default: no limit)"
+    group.add_argument("--record-budget", dest="record_budget_bytes", type=parse_budget, metavar="SIZE", help=text)
+    text = (
+        "folder of public ZeroMQ certificates *.key: these keys may join, in every role, and no other; there is "
+        "no pairing and no page then (default: the keys of `iris-session keys list`)"
     )
-    group.add_argument(
-        "--record-budget",
-        dest="record_budget_bytes",
-        type=parse_budget,
-        metavar="SIZE",
-        help="size that the recording may have, such as 20GB; the session goes on without one then (default: no limit)",
-    )
-    group.add_argument(
-        "--curve-clients",
-        metavar="DIR",
-        help="folder of public ZeroMQ certificates *.key: these keys may join, in every role, and no other; there is "
-        "no pairing and no page then (default: the keys of `iris-session keys list`)",
-    )
+    group.add_argument("--curve-clients", metavar="DIR", help=text)
     add_page_options(group, parse_free_port)
     group.add_argument("--view", action="store_true", help="show the recording in Rerun's viewer while it is written")
     group.add_argument("--no-web", dest="web", action="store_false", help="serve no page for browsers")
-    group.add_argument(
-        "--groups",
-        type=parse_groups,
-        metavar="GROUPS",
-        help="geom groups that clients show, such as 0,1,2 (default: as the model's own viewer)",
-    )
-    group.add_argument(
-        "--sites",
-        nargs="?",
-        const=True,
-        type=parse_sites,
-        metavar="GROUPS",
-        help="show all sites, those of these groups, or `none` (default: groups 0 to 2, as MuJoCo's viewer)",
-    )
+    text = "geom groups that clients show, such as 0,1,2 (default: as the model's own viewer)"
+    group.add_argument("--groups", type=parse_groups, metavar="GROUPS", help=text)
+    text = "show all sites, those of these groups, or `none` (default: groups 0 to 2, as MuJoCo's viewer)"
+    group.add_argument("--sites", nargs="?", const=True, type=parse_sites, metavar="GROUPS", help=text)
     group.add_argument("--assignment", choices=sorted(AssignmentPolicy.ALL), help="how robots are assigned")
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), help="lease mode of every robot")
 
@@ -484,13 +452,8 @@ def parse_pose(text: str) -> PoseTuple:
 
 def add_pose_option(parser: argparse.ArgumentParser, description: str) -> None:
     """Add the required option `--pose`."""
-    parser.add_argument(
-        "--pose",
-        type=parse_pose,
-        required=True,
-        metavar="X,Y,Z,QW,QX,QY,QZ",
-        help=f"{description}: metres, unit quaternion with w first",
-    )
+    text = f"{description}: metres, unit quaternion with w first"
+    parser.add_argument("--pose", type=parse_pose, required=True, metavar="X,Y,Z,QW,QX,QY,QZ", help=text)
 
 
 def parse_length(text: str) -> float:

@@ -44,22 +44,12 @@ def register(commands: Commands) -> None:
         "--bump-at", type=float, action="append", default=[], metavar="S",
         help="after this many seconds the tracking frames jump by 50 mm, unnoticed by the headsets; repeatable",
     )  # fmt: skip
-    parser.add_argument(
-        "--glance-every",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="observe the sheet again every S seconds while working",
-    )
+    text = "observe the sheet again every S seconds while working"
+    parser.add_argument("--glance-every", type=float, default=0.0, metavar="S", help=text)
     parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one headset in detail")
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
-    parser.add_argument(
-        "--join-timeout",
-        type=float,
-        default=15.0,
-        metavar="S",
-        help="stop if no session admits us within this time (%(default)s)",
-    )
+    text = "stop if no session admits us within this time (%(default)s)"
+    parser.add_argument("--join-timeout", type=float, default=15.0, metavar="S", help=text)
     parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key (*.key)")
     parser.add_argument("--curve-key", default="", metavar="FILE", help="CURVE secret key of the client (*.key_secret)")
     parser.add_argument("--orders", action="store_true", help="read lines: bump, recentre, drift or steady NAME")

@@ -38,12 +38,8 @@ def register(commands: Commands) -> None:
         """,
     )
     one.add_argument("name", help="name of the key in the list")
-    one.add_argument(
-        "key",
-        nargs="?",
-        default="",
-        help="ZeroMQ certificate (*.key), or the public key as 40 characters of Z85 (default: this user's own)",
-    )
+    text = "ZeroMQ certificate (*.key), or the public key as 40 characters of Z85 (default: this user's own)"
+    one.add_argument("key", nargs="?", default="", help=text)
     add_role_option(one)
     one = add_command(
         actions,

@@ -71,13 +71,11 @@ def register(commands: Commands) -> None:
     parser.add_argument("--address", default="", metavar="HOST[:PORT]", help="where others reach the session")
     parser.add_argument("--curve-key", default="", metavar="FILE", help="secret key of the session (default: yours)")
     parser.add_argument("--web", action="store_true", help="show a link to the page for browsers as the QR code")
-    parser.add_argument(
-        "--unity",
-        type=Path,
-        metavar="FILE",
-        help="write addresses, key of the certificate and code as JSON, which the headset apps read at start; secret "
-        "until the code is used",
+    text = (
+        "write addresses, key of the certificate and code as JSON, which the headset apps read at start; secret "
+        "until the code is used"
     )
+    parser.add_argument("--unity", type=Path, metavar="FILE", help=text)
     parser.add_argument("--web-port", type=parse_port, metavar="PORT", help="port of the page (default: it is found)")
     parser.add_argument("--png", type=Path, metavar="FILE", help="also write the QR code as an image")
     parser.add_argument("--web-cert", default="", metavar="FILE", help="certificate of the page (default: yours)")
@@ -86,13 +84,8 @@ def register(commands: Commands) -> None:
 
 def add_role_option(parser: argparse.ArgumentParser) -> None:
     """Add `--role`, for `pair` and `keys allow`."""
-    parser.add_argument(
-        "--role",
-        action="append",
-        choices=[*sorted(Role.ALL), ANY_ROLE],
-        metavar="ROLE",
-        help=f"role of the key, repeatable (default: {', '.join(DEFAULT_ROLES)}); {ANY_ROLE}: every role",
-    )
+    text = f"role of the key, repeatable (default: {', '.join(DEFAULT_ROLES)}); {ANY_ROLE}: every role"
+    parser.add_argument("--role", action="append", choices=[*sorted(Role.ALL), ANY_ROLE], metavar="ROLE", help=text)
 
 
 def parse_roles(names: list[str] | None) -> tuple[str, ...]:

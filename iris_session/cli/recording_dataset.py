@@ -31,12 +31,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("data sets (--to lerobot, robomimic or mcap)")
     whole = make_number_type(int, "a rate: give a whole number of frames a second, for example 30", 1, 1000)
     group.add_argument("--fps", type=whole, metavar="N", help="frames per second of simulated time (default: 30)")
-    group.add_argument(
-        "--cameras",
-        metavar="LIST",
-        help="pictures of every frame: cameras of the model, streams of recorded pictures, NAME=CAMERA, or places "
-        "NAME=X,Y,Z->X,Y,Z:FOVY, separated by commas (default: none)",
+    text = (
+        "pictures of every frame: cameras of the model, streams of recorded pictures, NAME=CAMERA, or places "
+        "NAME=X,Y,Z->X,Y,Z:FOVY, separated by commas (default: none)"
     )
+    group.add_argument("--cameras", metavar="LIST", help=text)
     group.add_argument("--size", type=parse_size, metavar="WxH", help="pixels of a drawn picture (default: 640x480)")
     looks = make_number_type(int, "a number of looks: give 0 to 1000", 0, 1000)
     group.add_argument("--looks", type=looks, metavar="N", help="every episode N more times: other light and colours")
@@ -51,12 +50,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--anonymise", action="store_true", help="p1, p2, ... in place of the names of people")
     jobs = make_number_type(int, "a number of processes: give 1 or more", 1, 1024)
     group.add_argument("--jobs", type=jobs, metavar="N", help="processes, an episode each (default: 1)")
-    group.add_argument(
-        "--ray",
-        metavar="ADDRESS",
-        help="a Ray cluster makes the episodes, a task each: local (this machine), auto, HOST:PORT or ray://HOST:PORT; "
-        "--jobs is then the number of tasks at once",
+    text = (
+        "a Ray cluster makes the episodes, a task each: local (this machine), auto, HOST:PORT or ray://HOST:PORT; "
+        "--jobs is then the number of tasks at once"
     )
+    group.add_argument("--ray", metavar="ADDRESS", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:

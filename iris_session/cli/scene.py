@@ -113,12 +113,11 @@ def run_robots(arguments: argparse.Namespace) -> int:
 
 
 def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scene",
-        metavar="FILE",
-        help="MJCF or MJB file, URDF, GLB, glTF, OBJ, STL, PLY, DAE or another file with geometry, or the name of a "
-        "scene (see `iris-session serve --help`)",
+    text = (
+        "MJCF or MJB file, URDF, GLB, glTF, OBJ, STL, PLY, DAE or another file with geometry, or the name of a "
+        "scene (see `iris-session serve --help`)"
     )
+    parser.add_argument("scene", metavar="FILE", help=text)
     add_file_options(parser)
     parser.add_argument("--assets", metavar="DIR", help="folder of assets (default: ~/.cache/iris-session/assets)")
 
@@ -245,13 +244,8 @@ SIMULATED: Final = (".xml", ".mjcf", ".mjb")
 
 
 def add_file_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--package-dir",
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="folder of packages that the file refers to by package://, or may refer into; repeatable",
-    )
+    text = "folder of packages that the file refers to by package://, or may refer into; repeatable"
+    parser.add_argument("--package-dir", action="append", default=[], metavar="DIR", help=text)
     parser.add_argument(
         "--scale",
         type=make_number_type(

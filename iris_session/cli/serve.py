@@ -69,59 +69,26 @@ def register(commands: Commands) -> None:
         notes=format_scene_names(),
     )
     parser.add_argument("scene", nargs="?", help="MJCF or MJB file, a file to show, or the name of a scene, see below")
-    parser.add_argument(
-        "--robots",
-        metavar="WHICH",
-        help="a robots file (.toml; see `iris-session robots`), names of robots found, separated by commas, `none`, or "
-        "`auto` (default)",
+    text = (
+        "a robots file (.toml; see `iris-session robots`), names of robots found, separated by commas, `none`, or "
+        "`auto` (default)"
     )
-    parser.add_argument(
-        "--anchors",
-        type=Path,
-        metavar="TOML",
-        help="poses of sheets and other anchors, instead of the scene's; see `iris-session anchors example`",
-    )
-    parser.add_argument(
-        "--assign",
-        action="append",
-        default=[],
-        metavar="NAME=ROBOT[,ROBOT]",
-        help="robots of a participant, repeatable; implies --assignment config",
-    )
-    parser.add_argument(
-        "--unaligned",
-        action="append",
-        default=[],
-        metavar="WHO",
-        help="a role, device or key:FINGERPRINT that may drive without an alignment too, repeatable (remote VR)",
-    )
-    parser.add_argument(
-        "--camera",
-        dest="cameras",
-        action="append",
-        type=Path,
-        metavar="TOML",
-        help="depth cameras to show as a point cloud, repeatable; see `iris-session cloud example`",
-    )
+    parser.add_argument("--robots", metavar="WHICH", help=text)
+    text = "poses of sheets and other anchors, instead of the scene's; see `iris-session anchors example`"
+    parser.add_argument("--anchors", type=Path, metavar="TOML", help=text)
+    text = "robots of a participant, repeatable; implies --assignment config"
+    parser.add_argument("--assign", action="append", default=[], metavar="NAME=ROBOT[,ROBOT]", help=text)
+    text = "a role, device or key:FINGERPRINT that may drive without an alignment too, repeatable (remote VR)"
+    parser.add_argument("--unaligned", action="append", default=[], metavar="WHO", help=text)
+    text = "depth cameras to show as a point cloud, repeatable; see `iris-session cloud example`"
+    parser.add_argument("--camera", dest="cameras", action="append", type=Path, metavar="TOML", help=text)
     parser.add_argument("--task", type=Path, metavar="TOML", help="task of the episodes; progress is kept beside it")
-    parser.add_argument(
-        "--picture",
-        dest="pictures",
-        action="append",
-        metavar="CAMERA[:WxH][@HZ]",
-        help="a camera of the model whose pictures clients get, repeatable (top:320x240@30 is top with the defaults)",
-    )
-    parser.add_argument(
-        "--plain-pictures",
-        action="store_true",
-        help="draw them without shadows, reflections and smooth edges: faster without a graphics card",
-    )
-    parser.add_argument(
-        "--resume",
-        type=Path,
-        metavar="RECORDING",
-        help="continue at the end of a recording (a .rrd or its folder): same session, participants, leases, scene",
-    )
+    text = "a camera of the model whose pictures clients get, repeatable (top:320x240@30 is top with the defaults)"
+    parser.add_argument("--picture", dest="pictures", action="append", metavar="CAMERA[:WxH][@HZ]", help=text)
+    text = "draw them without shadows, reflections and smooth edges: faster without a graphics card"
+    parser.add_argument("--plain-pictures", action="store_true", help=text)
+    text = "continue at the end of a recording (a .rrd or its folder): same session, participants, leases, scene"
+    parser.add_argument("--resume", type=Path, metavar="RECORDING", help=text)
     add_file_options(parser)
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
     add_session_options(parser)

@@ -95,13 +95,8 @@ def _format_key(row: dict[str, object]) -> str:
 def add_watch_options(group: argparse._ActionsContainer, parser: argparse.ArgumentParser) -> None:
     """Add `--watch` to `group`, and `--period` to `parser`."""
     group.add_argument("--watch", action="store_true", help="repeat until Ctrl-C")
-    parser.add_argument(
-        "--period",
-        type=parse_seconds,
-        default=1.0,
-        metavar="S",
-        help="--watch: seconds between two reports (default: %(default)s)",
-    )
+    text = "--watch: seconds between two reports (default: %(default)s)"
+    parser.add_argument("--period", type=parse_seconds, default=1.0, metavar="S", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -60,13 +60,8 @@ def register(commands: Commands) -> None:
             iris-session view --live                   follow the session that runs
         """,
     )
-    parser.add_argument(
-        "path",
-        nargs="?",
-        type=Path,
-        metavar="RECORDING",
-        help="a .rrd of a session, or a folder: the newest session in or below it (default: the folder sessions)",
-    )
+    text = "a .rrd of a session, or a folder: the newest session in or below it (default: the folder sessions)"
+    parser.add_argument("path", nargs="?", type=Path, metavar="RECORDING", help=text)
     parser.add_argument("--web", action="store_true", help="in a browser; the default where there is no display")
     parser.add_argument("--no-open", action="store_true", help="only make the copy, or with --web serve the page")
     parser.add_argument("--live", action="store_true", help="follow a session that runs, as it is recorded")

@@ -36,11 +36,8 @@ def register(commands: Commands) -> None:
         """,
     )
     add_address_options(parser)
-    parser.add_argument(
-        "--host",
-        metavar="ADDR",
-        help="address to listen on (default: all addresses; 127.0.0.1 if the session is not encrypted)",
-    )
+    text = "address to listen on (default: all addresses; 127.0.0.1 if the session is not encrypted)"
+    parser.add_argument("--host", metavar="ADDR", help=text)
     add_page_options(parser, parse_port)
 
 
