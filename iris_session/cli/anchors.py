@@ -386,7 +386,7 @@ def format_alignment_status(report: StatusReport) -> Iterator[str]:
     yield f"session '{report.session_name}'  {len(people)} headsets  {len(report.anchors)} anchors{still}"
     yield ""
     yield (
-        f"{'headset':20s} {'alignment':16s} {'version':>7s} {'age':>6s} {'at sheet':>9s} {'at robot':>9s} "
+        f"{'headset':20s} {'alignment':16s} {'version':>7s} {'age':>7s} {'at sheet':>9s} {'at robot':>9s} "
         f"{'obs.':>6s} {'places':>6s} {'tilt':>8s}  correction"
     )
     for p in people:
@@ -420,7 +420,7 @@ def _format_headset(p: ParticipantReport) -> Iterator[str]:
     correction = f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go" if is_pending else "-"
     at = [f"{m * 1e3:.1f} mm" if stated else "-" for m in (r.error_at_anchor_m, r.error_at_robot_m)]
     yield (
-        f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_age(p.alignment_age_ns) if aligned else '-':>6s} "
+        f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_age(p.alignment_age_ns) if aligned else '-':>7s} "
         f"{at[0]:>9s} {at[1]:>9s} {r.observations:6d} {r.viewpoints:6d} {degrees(r.residual_tilt_rad):4.1f} deg  "
         f"{correction}"
     )

@@ -170,9 +170,8 @@ def register_camera(actions: Commands) -> None:
     )
     one.add_argument("--intrinsics", type=Path, metavar="FILE", help=text)
     one.add_argument("--poses", type=Path, metavar="CSV", help="T_base_ee, pose of the robot's hand, per picture")
-    one.add_argument(
-        "--camera-on-hand", action="store_true", help="with --poses: the camera is on the hand, the sheet does not move"
-    )
+    text = "with --poses: the camera is on the hand, the sheet does not move"
+    one.add_argument("--camera-on-hand", action="store_true", help=text)
     text = "with --poses: known pose of the sheet on the hand, T_ee_sheet; one picture is enough"
     one.add_argument("--in-hand", type=parse_pose, metavar="X,Y,Z,QW,QX,QY,QZ", help=text)
     one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")

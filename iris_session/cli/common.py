@@ -310,9 +310,8 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--curve-key", metavar="FILE", help=text)
     record = group.add_mutually_exclusive_group()
-    record.add_argument(
-        "--record", type=parse_recording_name, metavar="FILE", help="path of the recording (default: below sessions/)"
-    )
+    text = "path of the recording (default: below sessions/)"
+    record.add_argument("--record", type=parse_recording_name, metavar="FILE", help=text)
     record.add_argument("--no-record", dest="record", action="store_const", const=False, help="record nothing")
     text = "frames per second of each point cloud and picture in the recording, or off (default: 2Hz)"
     group.add_argument("--record-clouds", dest="record_clouds_hz", type=parse_cloud_rate, metavar="RATE", help=text)

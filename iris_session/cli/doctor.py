@@ -38,9 +38,8 @@ def register(commands: Commands) -> None:
     parser.add_argument("--role", choices=sorted(Role.ALL), default=Role.OBSERVER, help="role to try (%(default)s)")
     parser.add_argument("--server", action="store_true", help="check this machine as a server")
     parser.add_argument("--identity", default="", metavar="DIR", help="folder of keys (default: as for every command)")
-    parser.add_argument(
-        "--record", type=Path, default=Path("sessions"), metavar="DIR", help="--server: folder of recordings"
-    )
+    text = "--server: folder of recordings"
+    parser.add_argument("--record", type=Path, default=Path("sessions"), metavar="DIR", help=text)
     parser.add_argument("--all", action="store_true", help="also print skipped checks")
 
 

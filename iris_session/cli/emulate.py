@@ -40,10 +40,8 @@ def register(commands: Commands) -> None:
     parser.add_argument("--count", type=int, default=1, help="number of headsets with --behaviour")
     parser.add_argument("--seed", type=int, default=0, help="random seed of frames, noise and motion")
     parser.add_argument("--drift", type=float, metavar="MM", help="drift of the tracking frames, mm per minute (1)")
-    parser.add_argument(
-        "--bump-at", type=float, action="append", default=[], metavar="S",
-        help="after this many seconds the tracking frames jump by 50 mm, unnoticed by the headsets; repeatable",
-    )  # fmt: skip
+    text = "after this many seconds the tracking frames jump by 50 mm, unnoticed by the headsets; repeatable"
+    parser.add_argument("--bump-at", type=float, action="append", default=[], metavar="S", help=text)
     text = "observe the sheet again every S seconds while working"
     parser.add_argument("--glance-every", type=float, default=0.0, metavar="S", help=text)
     parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one headset in detail")

@@ -64,10 +64,8 @@ def register(commands: Commands) -> None:
     )
     parser.add_argument("--repo", required=True, metavar="PATH", help="folder of a checkpoint, or its name on the hub")
     parser.add_argument("--robot", action="append", required=True, metavar="NAME", help="a robot, repeatable")
-    parser.add_argument(
-        "--camera", action="append", default=[], metavar="NAME",
-        help="a camera of the session, repeatable (default: those that the policy needs)",
-    )  # fmt: skip
+    text = "a camera of the session, repeatable (default: those that the policy needs)"
+    parser.add_argument("--camera", action="append", default=[], metavar="NAME", help=text)
     rate = make_number_type(float, "a rate: give 1 to 240 steps a second, for example 30", 1.0, 240.0)
     parser.add_argument("--hz", type=rate, default=HZ, help="steps a second, as in the data set (%(default)g)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:1, ... (%(default)s)")

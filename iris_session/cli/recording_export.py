@@ -53,9 +53,8 @@ def register(actions: Commands) -> None:
             iris-session recording export session.rrd --to assets -o scene-files
         """,
     )
-    parser.add_argument(
-        "paths", type=Path, nargs="+", metavar="RECORDING", help="a .rrd or folder; for a data set several"
-    )
+    text = "a .rrd or folder; for a data set several"
+    parser.add_argument("paths", type=Path, nargs="+", metavar="RECORDING", help=text)
     formats = (*DATASETS, *FORMATS, ASSETS)
     parser.add_argument("--to", required=True, choices=formats, help="format of the data set or tables, or assets")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FOLDER", help="folder for the files")
