@@ -99,18 +99,22 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         with ReadingProgress(path) as progress, Recording.open(path, warn=False) as recording:
             return summarise(recording, progress.show_steps)
 
-    files = list_files([arguments.path])
+    rows: list[dict[str, object]] = []
+
+    def refuse(path: str, why: str) -> None:
+        rows.append({"path": path, "ok": False, "error": why})
+        print_error(why)
+
+    files = list_files([arguments.path], lambda error: refuse(str(error.filename), str(error)))
     with ending_as_interrupts():
         if not arguments.path.is_dir():
             summary = summarise_file(arguments.path)
             return print_result(arguments, summary, format_summary(summary), ok=summary.ok)
-        rows: list[dict[str, object]] = []
         for file in files:
             try:
                 summary = summarise_file(file)
             except RecordingError as error:
-                rows.append({"path": str(file), "ok": False, "error": str(error)})
-                print_error(str(error))
+                refuse(str(file), str(error))
                 continue
             rows.append(msgspec.to_builtins(summary))
             if not arguments.json:
@@ -346,13 +350,17 @@ def run_verify(arguments: argparse.Namespace) -> int:
     from iris_session.session.verification import verify_recording
 
     reports: list[VerifyReport] = []
-    for path in list_files(arguments.files):
+
+    def refuse(path: str, why: str) -> None:
+        reports.append(VerifyReport(path, problems=[Problem(-1, "unreadable", "file", why)]))
+        print_error(why)
+
+    for path in list_files(arguments.files, lambda error: refuse(str(error.filename), str(error))):
         try:
             with ending_as_interrupts(), ReadingProgress(path) as progress:
                 report = verify_recording(path, progress.show_steps)
         except RecordingError as error:  # it hides no other
-            reports.append(VerifyReport(str(path), problems=[Problem(-1, "unreadable", "file", str(error))]))
-            print_error(str(error))
+            refuse(str(path), str(error))
             continue
         if not arguments.json:
             print(to_printable(f"{path}: {report.line()}"))
