@@ -299,8 +299,8 @@ def add_session_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--advertise", metavar="ADDR", help="address for clients, if a router forwards our ports")
     text = "block of ports: introduction N, control N+1, state N+2, ... N+6 (default: 7720)"
     group.add_argument("--port-base", type=parse_port_base, metavar="N", help=text)
-    no_beacon = "do not announce the session on the network"
-    group.add_argument("--no-beacon", dest="beacon_port", action="store_const", const=0, help=no_beacon)
+    text = "do not announce the session on the network"
+    group.add_argument("--no-beacon", dest="beacon_port", action="store_const", const=0, help=text)
     group.add_argument("--control-port", type=int, metavar="PORT", help="0: any free port")
     group.add_argument("--state-port", type=int, metavar="PORT", help="0: any free port")
     group.add_argument("--curve", action="store_true", help="encrypt on loopback too, and admit listed keys only")
