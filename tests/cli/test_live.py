@@ -103,6 +103,7 @@ def test_slow_display_delays_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     session = _Session()
     view = TerminalView(session, io.StringIO(), "title")  # type: ignore[arg-type]
     read, write = os.pipe()
+    os.set_blocking(read, False)
     os.set_blocking(write, False)
     view._pipe = write
     session.events = [
