@@ -117,15 +117,12 @@ def find_live(path: Path) -> Path:
 
 def choose_recording(path: Path) -> Path:
     """Return the recording to show: the newest of a folder, whose others are printed. Raises `CommandError`."""
-    if not path.is_dir():
-        if not path.exists():
-            raise CommandError(f"{path} does not exist: give a recording (session.rrd), or a folder with recordings")
-        return path
-    from iris_session.recording.folders import find_newest_s, find_recordings, group_by_session
+    from iris_session.dataset.episodes import list_files
+    from iris_session.recording.folders import find_newest_s, group_by_session
 
-    found = find_recordings(path, lambda error: print_error(str(error)))
-    if not found:
-        raise CommandError(f"there is no recording below the folder {path}: give a .rrd that `serve` or `demo` wrote")
+    found = list_files([path], lambda error: print_error(str(error)))
+    if not path.is_dir():
+        return path
     newest = group_by_session(found)
     if len(newest) > 1:
         print(f"{len(newest)} sessions below {to_printable(str(path))}, the newest is shown; the others:")
