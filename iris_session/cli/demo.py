@@ -62,24 +62,17 @@ def register(commands: Commands) -> None:
     plan.add_argument("--object", default="", metavar="NAME", help="the object (default: the only free body)")
     plan.add_argument("--from", default="", metavar="ROBOT", help="who gives (default: the nearest)")
     plan.add_argument("--to", default="", metavar="ROBOT", help="who takes (default: the other)")
-    plan.add_argument(
-        "--episodes",
-        type=make_number_type(int, "a number of handovers: give 1 to 1000", 1, 1000),
-        metavar="N",
-        help="handovers; with several the object lies a little elsewhere in each (default: 1)",
-    )
+    text = "handovers; with several the object lies a little elsewhere in each (default: 1)"
+    count = make_number_type(int, "a number of handovers: give 1 to 1000", 1, 1000)
+    plan.add_argument("--episodes", type=count, metavar="N", help=text)
     parser.add_argument("--operators", type=int, default=2, metavar="N", help="operators in pairs, 2 to 8 (default: 2)")
     parser.add_argument("--observers", type=int, default=0, metavar="N", help="observers; 0 to 16 (default: 0)")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the emulated operators")
     parser.add_argument("--timeout", type=parse_seconds, metavar="S", help="at most so long (150, 60 more per episode)")
     link = parser.add_mutually_exclusive_group()
     link.add_argument("--profile", default="", metavar="NAME", help="link of every operator (docs/evidence/links.md)")
-    link.add_argument(
-        "--latency",
-        type=make_number_type(float, "a delay: give 0 to 10000 milliseconds, for example 40", 0.0, 10_000.0),
-        metavar="MS",
-        help="delay of every operator's link, each way",
-    )
+    delay = make_number_type(float, "a delay: give 0 to 10000 milliseconds, for example 40", 0.0, 10_000.0)
+    link.add_argument("--latency", type=delay, metavar="MS", help="delay of every operator's link, each way")
     add_session_options(parser)
     parser.set_defaults(control_port=0, state_port=0)
 

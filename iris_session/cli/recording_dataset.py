@@ -39,9 +39,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--size", type=parse_size, metavar="WxH", help="pixels of a drawn picture (default: 640x480)")
     looks = make_number_type(int, "a number of looks: give 0 to 1000", 0, 1000)
     group.add_argument("--looks", type=looks, metavar="N", help="every episode N more times: other light and colours")
-    group.add_argument(
-        "--seed", type=make_number_type(int, "a seed: give a whole number from 0", 0), metavar="N", help="of the looks"
-    )
+    seed = make_number_type(int, "a seed: give a whole number from 0", 0)
+    group.add_argument("--seed", type=seed, metavar="N", help="of the looks")
     group.add_argument("--plain", action="store_true", help="pictures without shadows: faster without a graphics card")
     group.add_argument("--depth", action="store_true", help="depth of every picture too (robomimic, mcap)")
     group.add_argument("--masks", action="store_true", help="the body of every pixel too (robomimic, mcap)")

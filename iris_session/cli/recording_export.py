@@ -58,21 +58,14 @@ def register(actions: Commands) -> None:
     formats = (*DATASETS, *FORMATS, ASSETS)
     parser.add_argument("--to", required=True, choices=formats, help="format of the data set or tables, or assets")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FOLDER", help="folder for the files")
-    parser.add_argument(
-        "--hz",
-        type=make_number_type(float, "a rate: give rows per second above 0, for example 100", ABOVE_0),
-        metavar="RATE",
-        help="rows per second of robots, objects and commands; at the rate of the session, every step (default: 100)",
-    )
+    text = "rows per second of robots, objects and commands; at the rate of the session, every step (default: 100)"
+    rate = make_number_type(float, "a rate: give rows per second above 0, for example 100", ABOVE_0)
+    parser.add_argument("--hz", type=rate, metavar="RATE", help=text)
     parser.add_argument("--robot", action="append", default=[], metavar="NAME", help="only this robot; repeatable")
     parser.add_argument("--object", action="append", default=[], metavar="NAME", help="only this object; repeatable")
-    parser.add_argument(
-        "--table",
-        action="append",
-        default=[],
-        choices=("robots", "objects", "commands", "samples", "events"),
-        help="only tables of this kind; repeatable",
-    )
+    kinds = ("robots", "objects", "commands", "samples", "events")
+    text = "only tables of this kind; repeatable"
+    parser.add_argument("--table", action="append", default=[], choices=kinds, help=text)
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty, replace its files")
     recording_dataset.add_options(parser)
 

@@ -246,14 +246,9 @@ SIMULATED: Final = (".xml", ".mjcf", ".mjb")
 def add_file_options(parser: argparse.ArgumentParser) -> None:
     text = "folder of packages that the file refers to by package://, or may refer into; repeatable"
     parser.add_argument("--package-dir", action="append", default=[], metavar="DIR", help=text)
-    parser.add_argument(
-        "--scale",
-        type=make_number_type(
-            float, "a factor: give a number above 0, for example 0.001 for a file in millimetres", ABOVE_0
-        ),
-        metavar="FACTOR",
-        help="scale of the file: 0.001 for millimetres; not for MJCF and MJB, which are simulated",
-    )
+    wanted = "a factor: give a number above 0, for example 0.001 for a file in millimetres"
+    text = "scale of the file: 0.001 for millimetres; not for MJCF and MJB, which are simulated"
+    parser.add_argument("--scale", type=make_number_type(float, wanted, ABOVE_0), metavar="FACTOR", help=text)
     parser.add_argument("--collisions", action="store_true", help="of a URDF: draw collision shapes, not visuals")
 
 

@@ -65,13 +65,9 @@ def register(commands: Commands) -> None:
     parser.add_argument("--web", action="store_true", help="in a browser; the default where there is no display")
     parser.add_argument("--no-open", action="store_true", help="only make the copy, or with --web serve the page")
     parser.add_argument("--live", action="store_true", help="follow a session that runs, as it is recorded")
-    parser.add_argument(
-        "--port",
-        type=make_number_type(int, "a port: give 1 to 65534, or 0 for a free one", 0, 65534),
-        default=0,
-        metavar="N",
-        help="port of the viewer; with --web of the page, which gets its data from port N+1 (default: free ones)",
-    )
+    port = make_number_type(int, "a port: give 1 to 65534, or 0 for a free one", 0, 65534)
+    text = "port of the viewer; with --web of the page, which gets its data from port N+1 (default: free ones)"
+    parser.add_argument("--port", type=port, default=0, metavar="N", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
