@@ -162,27 +162,29 @@ def format_summary(summary: RecordingSummary) -> Iterator[str]:
     yield f"  objects    {_join(summary.objects)}"
     if summary.deformables:
         yield f"  deforming  {_join(summary.deformables)}"
-    yield from _format_list("people", [_format_person(person) for person in summary.people])
-    yield from _format_list("alignment", [*_format_alignments(summary.people)])
-    yield from _format_list("episodes", [_format_episode(one) for one in summary.episodes])
     handovers = [
         f"{one.object}: {_format_hand(one.giver, one.giver_name)} to {_format_hand(one.receiver, one.receiver_name)} "
         f"at {one.at_s:.2f} s, both held it for {one.both_held_s:.2f} s"
         for one in summary.handovers
     ]
-    yield from _format_list("handovers", handovers)
-    yield from _format_list("e-stops", [_format_stop(stop) for stop in summary.stops])
-    if summary.pauses:
-        yield from _format_list("pauses", [_format_stop(pause) for pause in summary.pauses])
-    if summary.scene_changes:
-        yield from _format_list("scene", [f"{one.cause} at {one.at_s:.2f} s" for one in summary.scene_changes])
-    if summary.streams:
-        yield from _format_list("streams", [_format_stream(stream) for stream in summary.streams])
-    yield from _format_list("assets", _format_assets(summary.assets))
-    yield from _format_list("drops", [*_format_drops(summary)])
-    yield from _format_list("damage", summary.damage)
-    if summary.notes:
-        yield from _format_list("notes", summary.notes)
+    lists: dict[str, Sequence[str]] = {
+        "people": [*map(_format_person, summary.people)],
+        "alignment": [*_format_alignments(summary.people)],
+        "episodes": [*map(_format_episode, summary.episodes)],
+        "handovers": handovers,
+        "e-stops": [*map(_format_stop, summary.stops)],
+        "pauses": [*map(_format_stop, summary.pauses)],
+        "scene": [f"{one.cause} at {one.at_s:.2f} s" for one in summary.scene_changes],
+        "streams": [*map(_format_stream, summary.streams)],
+        "assets": _format_assets(summary.assets),
+        "drops": [*_format_drops(summary)],
+        "damage": summary.damage,
+        "notes": summary.notes,
+    }
+    for title, lines in lists.items():
+        if lines or title not in ("pauses", "scene", "streams", "notes"):
+            for i, line in enumerate(list_first(lines or ["none"])):
+                yield f"  {title if i == 0 else '':9s}  {line}"
 
 
 def _format_episode(one: EpisodeSummary) -> str:
@@ -192,11 +194,6 @@ def _format_episode(one: EpisodeSummary) -> str:
     parts += [f"task {one.task}"] if one.task else []
     parts += [f"with {', '.join(one.robots)}"] if one.robots else []
     return ", ".join(parts)
-
-
-def _format_list(title: str, lines: Sequence[str]) -> Iterator[str]:
-    for i, line in enumerate(list_first(lines or ["none"])):
-        yield f"  {title if i == 0 else '':9s}  {line}"
 
 
 def _format_person(person: PersonSummary) -> str:
