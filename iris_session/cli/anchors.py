@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Any, Final
 from iris_session.cli import anchors_solve, calibrate
 from iris_session.cli.common import (
     CommandError,
+    Commands,
+    add_actions,
     add_address_options,
     add_command,
-    add_json_option,
     add_pose_option,
     find_participant,
+    list_first,
     make_client,
     open_scene,
     parse_length,
@@ -30,43 +32,27 @@ from iris_session.cli.common import (
     write_file,
 )
 from iris_session.cli.status import add_watch_options, run_status_command
-from iris_session.doctor.headset_checks import is_consistent
+from iris_session.doctor.headset_checks import format_age, is_consistent
 from iris_session.protocol.names import AlignAction, AlignmentKind, Role
 
 if TYPE_CHECKING:
     from anchors.sheet import Sheet
     from iris_session.client import Client
     from iris_session.protocol.server_messages import ParticipantInfo
-    from iris_session.protocol.status import AlignmentReport, CrossCheckReport, ParticipantReport, StatusReport
+    from iris_session.protocol.status import CrossCheckReport, ParticipantReport, StatusReport
 
 #: Edge of the code with marks where none is given: it must be smaller than the default sheet to fit on A4.
 MARKED_SHEET_M: Final = 0.140
-#: A printed sheet that is further off its size is no print of that sheet at 100 %.
-MAX_MISPRINT: Final = 0.05
 ALL_PARTICIPANTS: Final = "all"
-#: Sheets listed per headset, most recently observed first.
-MAX_LISTED_SHEETS: Final = 8
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `anchors`."""
-    parser = add_command(
+def register(commands: Commands) -> None:
+    actions = add_actions(
         commands,
         "anchors",
-        None,
         help="print anchor sheets, align headsets, calibrate cameras",
         description="Print sheets that headsets and cameras detect, align headsets to them, and calibrate cameras.",
-        examples="""
-            iris-session anchors print --size 150mm --id table --out table.pdf
-            iris-session anchors example > anchors.toml
-            iris-session anchors status --watch
-            iris-session anchors align start ann
-            iris-session anchors solve sessions/20261121T093000.000000Z-lab/session.rrd --out anchors.toml
-            iris-session anchors calibrate-camera pictures --sheet table=150mm --poses poses.csv
-            iris-session anchors calibrate-camera pictures --sheet table=150mm --at table=0,-0.45,0,1,0,0,0
-        """,
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _register_print(actions)
     _register_example(actions)
     _register_status(actions)
@@ -77,8 +63,7 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     calibrate.register_camera(actions)
 
 
-def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `print`."""
+def _register_print(actions: Commands) -> None:
     one = add_command(
         actions,
         "print",
@@ -94,25 +79,17 @@ def _register_print(actions: argparse._SubParsersAction[argparse.ArgumentParser]
             iris-session anchors print --id table --measured 149.2mm
         """,
     )
-    one.add_argument(
-        "--size", type=parse_length, metavar="LENGTH", help="edge of the QR code (150mm; with --marks 140mm)"
-    )
+    one.add_argument("--size", type=parse_length, metavar="LENGTH", help="edge of the QR code (150mm; --marks: 140mm)")
     one.add_argument("--marks", action="store_true", help="four crosses around the frame; a4 holds sizes up to 142mm")
-    one.add_argument(
-        "--measured",
-        type=parse_length,
-        metavar="LENGTH",
-        help="edge of the printed code by a ruler: print the lines for the anchors file, write no sheet",
-    )
+    text = "edge of the printed code by a ruler: print the lines for the anchors file, write no sheet"
+    one.add_argument("--measured", type=parse_length, metavar="LENGTH", help=text)
     _add_layout_option(one)
     one.add_argument("--id", default="table", metavar="NAME", help="id of the anchor (%(default)s)")
     one.add_argument("--paper", default="a4", metavar="PAPER", help="a5, a4, a3, a2, letter or tabloid (%(default)s)")
     one.add_argument("-o", "--out", type=Path, metavar="FILE", help="*.pdf or *.svg (default: NAME.pdf)")
-    add_json_option(one)
 
 
-def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `example`."""
+def _register_example(actions: Commands) -> None:
     one = add_command(
         actions,
         "example",
@@ -125,29 +102,17 @@ def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParse
             iris-session anchors example --marks > anchors.toml
         """,
     )
-    one.add_argument(
-        "scene",
-        nargs="?",
-        default="",
-        help="name of a scene (see `iris-session serve --help`); default: one sheet, `table`",
-    )
+    one.add_argument("scene", nargs="?", default="", help="a scene of `serve --help` (default: one sheet, `table`)")
     one.add_argument("--marks", action="store_true", help="of sheets with marks, as `print --marks` writes them")
     _add_layout_option(one)
-    add_json_option(one)
 
 
 def _add_layout_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--layout",
-        type=int,
-        choices=(1, 2),
-        default=2,
-        help="2: with the white around the code that headsets ask for; 1: as printed before",
-    )
+    text = "2: with the white around the code that headsets ask for; 1: as printed before"
+    parser.add_argument("--layout", type=int, choices=(1, 2), default=2, help=text)
 
 
-def _register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `status`."""
+def _register_status(actions: Commands) -> None:
     one = add_command(
         actions,
         "status",
@@ -163,11 +128,9 @@ def _register_status(actions: argparse._SubParsersAction[argparse.ArgumentParser
     )
     add_address_options(one)
     add_watch_options(one, one)
-    add_json_option(one)
 
 
-def _register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `align`."""
+def _register_align(actions: Commands) -> None:
     one = add_command(
         actions,
         "align",
@@ -182,19 +145,12 @@ def _register_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]
         """,
     )
     one.add_argument("what", choices=sorted(AlignAction.ALL))
-    one.add_argument(
-        "participant",
-        nargs="?",
-        default=ALL_PARTICIPANTS,
-        metavar="PARTICIPANT",
-        help="name or id, or `all` (%(default)s)",
-    )
+    text = "name or id, or `all` (%(default)s)"
+    one.add_argument("participant", nargs="?", default=ALL_PARTICIPANTS, metavar="PARTICIPANT", help=text)
     add_address_options(one, option=True)
-    add_json_option(one)
 
 
-def _register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `place`."""
+def _register_place(actions: Commands) -> None:
     one = add_command(
         actions,
         "place",
@@ -211,11 +167,9 @@ def _register_place(actions: argparse._SubParsersAction[argparse.ArgumentParser]
     add_pose_option(one, "T_world_tracking, or the offset in the world")
     one.add_argument("--offset", action="store_true", help="the pose is an offset to the measured alignment")
     add_address_options(one, option=True)
-    add_json_option(one)
 
 
-def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `move`."""
+def _register_move(actions: Commands) -> None:
     one = add_command(
         actions,
         "move",
@@ -232,7 +186,6 @@ def _register_move(actions: argparse._SubParsersAction[argparse.ArgumentParser])
     add_pose_option(one, "T_world_anchor")
     one.add_argument("--force", action="store_true", help="allow more than 5 m from the present position")
     add_address_options(one, option=True)
-    add_json_option(one)
 
 
 def run_print(arguments: argparse.Namespace) -> int:
@@ -268,21 +221,19 @@ def run_print(arguments: argparse.Namespace) -> int:
     result = {"file": str(out), "id": sheet.anchor_id, "size_m": sheet.edge_m, "paper": arguments.paper}
     result |= {"layout": sheet.layout, "for_headsets": sheet.edge_m >= HEADSET_MIN_EDGE_M}
     result |= {"markers": sheet.marker_ids, "marker_edge_m": sheet.marker_edge_m, "marks_m": sheet.marks}
-    print_result(arguments, result, lines)
-    return 0
+    return print_result(arguments, result, lines)
 
 
 def _print_measured(arguments: argparse.Namespace, sheet: Sheet, size_m: float) -> int:
     """Print the lines of the anchors file for a sheet as it was measured. Raises `CommandError` for a misprint."""
     scale = sheet.edge_m / size_m - 1.0
-    if abs(scale) > MAX_MISPRINT:
+    if abs(scale) > 0.05:  # it is no print of that sheet at 100 %
         raise CommandError(
             f"{1e3 * sheet.edge_m:g} mm is {scale:+.1%} off {1e3 * size_m:g} mm: print at 100 % again, or give the "
             "size that it was printed for by --size"
         )
     result = {"id": sheet.anchor_id, "size_m": sheet.edge_m, "printed_for_m": size_m, "marks_m": sheet.marks}
-    print_result(arguments, result, [f"[anchors.{json.dumps(sheet.anchor_id)}]", *_list_file_lines(sheet)])
-    return 0
+    return print_result(arguments, result, [f"[anchors.{json.dumps(sheet.anchor_id)}]", *_list_file_lines(sheet)])
 
 
 def _list_file_lines(sheet: Sheet) -> list[str]:
@@ -339,8 +290,7 @@ def run_align(arguments: argparse.Namespace) -> int:
     started = arguments.what == AlignAction.START
     outcome = "started: bring the sheets into view" if started else "stopped: alignment kept"
     lines = (f"{one['name']} ({one['id']}): {one['denied'] or outcome}" for one in done)
-    print_result(arguments, {"ok": ok, "action": arguments.what, "participants": done}, lines)
-    return 0 if ok else 1
+    return print_result(arguments, {"ok": ok, "action": arguments.what, "participants": done}, lines, ok=ok)
 
 
 def run_place(arguments: argparse.Namespace) -> int:
@@ -350,8 +300,7 @@ def run_place(arguments: argparse.Namespace) -> int:
         client.alignment.place(one.id, arguments.pose, offset=arguments.offset)
     line = f"{one.name} ({one.id}) is {'moved by the offset' if arguments.offset else 'placed'}"
     result = {"ok": True, "participant": {"id": one.id, "name": one.name}, "offset": arguments.offset}
-    print_result(arguments, result, [line])
-    return 0
+    return print_result(arguments, result, [line])
 
 
 def run_move(arguments: argparse.Namespace) -> int:
@@ -373,8 +322,7 @@ def run_move(arguments: argparse.Namespace) -> int:
     first = f"anchor '{arguments.anchor}' {by}: {len(follow)} alignments measured to it follow"
     ids = {"follow": [p.id for p in follow], "stay": list(stay)}
     result = {"ok": True, "anchor": arguments.anchor, "moved_m": moved_m, **ids}
-    print_result(arguments, result, [first, *(f"    unchanged: {line}" for line in stay.values())])
-    return 0
+    return print_result(arguments, result, [first, *(f"    unchanged: {line}" for line in stay.values())])
 
 
 def explain_unaffected_alignment(p: ParticipantReport, anchor: str) -> str:
@@ -390,11 +338,7 @@ def explain_unaffected_alignment(p: ParticipantReport, anchor: str) -> str:
 
 
 def select_participants(client: Client, name: str) -> list[ParticipantInfo]:
-    """Return the participant with an id or name, or all with a headset for `all`.
-
-    Raises:
-        CommandError: There is none, or several have the name.
-    """
+    """Return the participant with an id or name, or all with a headset for `all`. Raises `CommandError`."""
     people = list(client.mirror.participants.values())
     if name != ALL_PARTICIPANTS or any(name in (one.id, one.name) for one in people):
         return [find_participant(client, name)]
@@ -442,7 +386,7 @@ def format_alignment_status(report: StatusReport) -> Iterator[str]:
     yield f"session '{report.session_name}'  {len(people)} headsets  {len(report.anchors)} anchors{still}"
     yield ""
     yield (
-        f"{'headset':20s} {'alignment':16s} {'version':>7s} {'age':>6s} {'at sheet':>9s} {'at robot':>9s} "
+        f"{'headset':20s} {'alignment':16s} {'version':>7s} {'age':>7s} {'at sheet':>9s} {'at robot':>9s} "
         f"{'obs.':>6s} {'places':>6s} {'tilt':>8s}  correction"
     )
     for p in people:
@@ -472,40 +416,31 @@ def _format_headset(p: ParticipantReport) -> Iterator[str]:
     kind = p.alignment + (" + offset" if r.offset else "") + ("" if r.running else " STOPPED")
     aligned = p.alignment in (AlignmentKind.MEASURED, AlignmentKind.PLACED, *AlignmentKind.VIEW_ONLY)
     stated = aligned and p.alignment != AlignmentKind.PLACED and not r.offset
+    is_pending = r.pending_m > 0.0 or r.pending_rad > 0.0  # not yet in force
+    correction = f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go" if is_pending else "-"
     at = [f"{m * 1e3:.1f} mm" if stated else "-" for m in (r.error_at_anchor_m, r.error_at_robot_m)]
     yield (
-        f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_duration(p.alignment_age_ns) if aligned else '-':>6s} "
+        f"{name:20.20s} {kind:16.16s} {r.version:7d} {format_age(p.alignment_age_ns) if aligned else '-':>7s} "
         f"{at[0]:>9s} {at[1]:>9s} {r.observations:6d} {r.viewpoints:6d} {degrees(r.residual_tilt_rad):4.1f} deg  "
-        f"{format_pending_correction(r)}"
+        f"{correction}"
     )
     if r.doubt:
         yield f"    UNCONFIRMED ({r.doubt}): begins no engagement until a look at a sheet"
     if aligned and r.confirmed_ns >= 0:
-        yield f"    confirmed {format_duration(r.confirmed_ns)} ago"
+        yield f"    confirmed {format_age(r.confirmed_ns)} ago"
     if not aligned and p.alignment_void_ns >= 0:
-        yield f"    void for {format_duration(p.alignment_void_ns)}: the tracking frame jumped"
+        yield f"    void for {format_age(p.alignment_void_ns)}: the tracking frame jumped"
     seen = sorted(r.seen, key=lambda one: one.age_ns)
     if seen:
-        sheets = [
-            f"{one.anchor_id} {one.observations} times, {format_duration(one.age_ns)} ago"
-            for one in seen[:MAX_LISTED_SHEETS]
-        ]
-        more = f"; {len(seen) - MAX_LISTED_SHEETS} more" if len(seen) > MAX_LISTED_SHEETS else ""
+        sheets = [f"{one.anchor_id} {one.observations} times, {format_age(one.age_ns)} ago" for one in seen]
         unusable = f"; {r.unusable} unusable" if r.unusable else ""
-        yield f"    saw {'; '.join(sheets)}{more}{unusable}"
+        yield f"    saw {'; '.join(list_first(sheets, most=8))}{unusable}"
     elif r.unusable:
         yield f"    observed nothing usable, {r.unusable} times"
     if r.alarm:
-        yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {format_duration(r.alarm_ns)} ago"
+        yield f"    ALARM {r.alarm}: off by {r.alarm_size_m * 1e3:.0f} mm, {format_age(r.alarm_ns)} ago"
     if r.advice:
         yield f"    advice: {r.advice}"
-
-
-def format_pending_correction(r: AlignmentReport) -> str:
-    """Return the rest of a correction that is not yet in force."""
-    if not (r.pending_m > 0.0 or r.pending_rad > 0.0):
-        return "-"
-    return f"{r.pending_m * 1e3:.1f} mm, {degrees(r.pending_rad):.2f} deg to go"
 
 
 def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:
@@ -516,13 +451,5 @@ def _format_cross_check(check: CrossCheckReport, names: dict[str, str]) -> str:
     how = "touched by both" if check.touched else f"{check.n} observations"
     return (
         f"{a} - {b}: {check.error_m * 1e3:.1f} mm{turn} apart at '{check.anchor_id}', "
-        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {how}, {format_duration(check.age_ns)} ago{verdict}"
+        f"95 % expected below {check.expected_p95_m * 1e3:.1f} mm; {how}, {format_age(check.age_ns)} ago{verdict}"
     )
-
-
-def format_duration(duration_ns: int) -> str:
-    """Return a duration as seconds or minutes."""
-    seconds = duration_ns * 1e-9
-    if seconds < 0.0:
-        return "never"
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"

@@ -8,13 +8,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from anchors.pose import pose_to_dict
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
+    list_first,
     pick_attributes,
     print_result,
     write_file,
@@ -27,12 +28,8 @@ if TYPE_CHECKING:
     from iris_session.alignment.resolve import FrameResult, LiveComparison, RelativePoses
     from iris_session.recording import AlignmentHistory, RecordedParticipant, Recording
 
-#: Printed alignments and outliers per tracking frame; `--json` has all.
-MAX_LISTED: Final = 12
 
-
-def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `solve`."""
+def register(actions: Commands) -> None:
     one = add_command(
         actions,
         "solve",
@@ -48,14 +45,9 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
             iris-session anchors solve session.rrd --out anchors.toml
         """,
     )
-    one.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="a .rrd file; later parts are found by their names"
-    )
-    one.add_argument(
-        "--anchors", type=Path, metavar="TOML", help="true poses of the anchors (default: those of the session)"
-    )
+    one.add_argument("recording", type=Path, metavar="RECORDING", help="a .rrd file; its later parts are found, too")
+    one.add_argument("--anchors", type=Path, metavar="TOML", help="true poses of anchors (default: the session's)")
     one.add_argument("--out", type=Path, metavar="FILE", help="write the poses of the sheets, for `serve --anchors`")
-    add_json_option(one)
 
 
 def run_solve(arguments: argparse.Namespace) -> int:
@@ -160,35 +152,22 @@ def _format_frame(person: RecordedParticipant, r: FrameResult) -> Iterator[str]:
         )
     if 2 * r.unused.get("against gravity", 0) > r.looks:
         yield "    most observations contradict gravity: the sheet is not oriented as configured (table or wall?)"
-    yield from _limit_lines(
-        [_format_comparison(one) for one in _select_worst(r.compared)], len(r.compared), "alignments"
-    )
+    worst_first = sorted(r.compared, key=lambda one: -max(one.off_m or 0.0, one.off_end_m or 0.0))
+    compared = [_format_comparison(one) for one in worst_first]
     outliers = [
-        f"    outlier: '{o.anchor_id}' from place {o.viewpoint_id} at {o.at_ns * 1e-9:.1f} s, {o.looks} observations: "
+        f"outlier: '{o.anchor_id}' from place {o.viewpoint_id} at {o.at_ns * 1e-9:.1f} s, {o.looks} observations: "
         f"{_format_mm(o.off_m)}, {math.degrees(o.off_rad):.1f} deg off, "
         f"95 % expected below {_format_mm(o.expected_p95_m)}"
         for o in r.outliers
     ]
-    yield from _limit_lines(outliers[:MAX_LISTED], len(outliers), "outliers")
-
-
-def _select_worst(compared: list[LiveComparison]) -> list[LiveComparison]:
-    """Return the alignments with the largest errors, in order of time."""
-    kept = sorted(compared, key=lambda one: -max(one.off_m or 0.0, one.off_end_m or 0.0))[:MAX_LISTED]
-    return sorted(kept, key=lambda one: one.live.since_ns)
-
-
-def _limit_lines(shown: list[str], of: int, what: str) -> Iterator[str]:
-    yield from shown
-    if of > len(shown):
-        yield f"    ... {of - len(shown)} more {what}, listed by --json"
+    yield from (f"    {line}" for lines in (compared, outliers) for line in list_first(lines, most=12))
 
 
 def _format_comparison(one: LiveComparison) -> str:
     a, until = one.live.alignment, one.live.until_ns
     end = "the end" if until < 0 else f"{until * 1e-9:.1f} s"
     kind = a.kind + (" with offset" if a.offset else "")
-    head = f"    version {a.version} ({kind}), {one.live.since_ns * 1e-9:.1f} s to {end}"
+    head = f"version {a.version} ({kind}), {one.live.since_ns * 1e-9:.1f} s to {end}"
     if one.off_m is None or one.off_rad is None:
         return f"{head}: no observations to compare with"
     stated = "no error stated" if one.stated_m is None else f"stated {_format_mm(one.stated_m)}"

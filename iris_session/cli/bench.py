@@ -5,95 +5,97 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from iris_session.cli.common import CommandError, add_command, add_json_option, parse_seconds, print_result
+from iris_session.cli.common import (
+    CommandError,
+    Commands,
+    add_actions,
+    add_command,
+    make_number_type,
+    parse_seconds,
+    print_result,
+)
 
 if TYPE_CHECKING:
     from iris_session.bench.report import BenchReport
 
 
-class _Benchmark(NamedTuple):
-    """One benchmark: `run_NAME` in a module of `iris_session.bench`.
+class Range(NamedTuple):
+    """A number of an option: its default, and what a scene or a session can have."""
 
-    Attributes:
-        text: What it measures, for its help.
-        options: Its options, as the parameters of `run_NAME`, and their defaults.
-        limits: Lowest and highest values that a scene or a session can have.
-    """
-
-    text: str
-    options: dict[str, int | float | str]
-    limits: dict[str, tuple[int, int]]
+    default: int | float
+    low: int
+    high: int
 
 
-_CLIENTS: Final = {"clients": (1, 64)}
-_BODIES: Final = {"bodies": (1, 2000)}
-_VERTICES: Final = {"vertices": (16, 10_000)}
-_BENCHMARKS: Final = {
-    "state": _Benchmark(
+Options = dict[str, Range | float | str]
+#: Options of most benchmarks, and of those with a session and clients.
+_RUN: Final[Options] = {"seconds": 20.0, "seed": 0}
+_SESSION: Final[Options] = {**_RUN, "curve": False, "profile": ""}
+_BODIES: Final = Range(300, 1, 2000)
+_VERTICES: Final = Range(10_000, 16, 10_000)
+#: Benchmark, `run_NAME` in a module of `iris_session.bench`: what it measures, and its parameters with their defaults.
+BENCHMARKS: Final[dict[str, tuple[str, Options]]] = {
+    "state": (
         "age, size and error of the state that clients receive",
-        {"clients": 16, "bodies": 300, "seconds": 20.0, "seed": 0, "curve": False, "profile": ""},
-        _CLIENTS | _BODIES,
+        {"clients": Range(16, 1, 64), "bodies": _BODIES, **_SESSION},
     ),
-    "input": _Benchmark(
+    "input": (
         "time from the receipt of a sample to the first frame that shows it applied",
-        {"operators": 8, "robots": 8, "observers": 8, "seconds": 20.0, "seed": 0, "curve": False, "profile": ""},
-        {"robots": (1, 12), "observers": (0, 64)},
+        {"operators": Range(8, 1, 12), "robots": Range(8, 1, 12), "observers": Range(8, 0, 64), **_SESSION},
     ),
-    "slow-client": _Benchmark(
+    "slow-client": (
         "two clients that stall in turn: their recovery, and the effect on the others",
-        {"clients": 16, "bodies": 300, "seconds": 50.0, "seed": 0, "curve": False, "profile": ""},
-        {"clients": (3, 64), **_BODIES},
+        {"clients": Range(16, 3, 64), "bodies": _BODIES, **_SESSION, "seconds": 50.0},
     ),
-    "alignment": _Benchmark(
+    "alignment": (
         "distance at which two headsets place the same point",
-        {"pairs": 2000, "headsets": 200, "worlds": "none", "seed": 0},
-        {"pairs": (10, 100_000), "headsets": (2, 100_000)},
+        {"pairs": Range(2000, 10, 100_000), "headsets": Range(200, 2, 100_000), "worlds": "none", "seed": 0},
     ),
-    "deformable": _Benchmark(
+    "deformable": (
         "a cloth in motion, encoded by the session and decoded by clients",
-        {"vertices": 10_000, "clients": 4, "seconds": 20.0, "seed": 0, "curve": False, "profile": ""},
-        _CLIENTS | _VERTICES,
+        {"vertices": _VERTICES, "clients": Range(4, 1, 64), **_SESSION},
     ),
-    "cloud": _Benchmark(
+    "cloud": (
         "depth pictures become clouds that are sent to a session",
-        {"points": 2_000_000, "cameras": 1, "seconds": 20.0, "seed": 0, "beside": False},
-        {"points": (10_000, 20_000_000), "cameras": (1, 4)},
+        {"points": Range(2_000_000, 10_000, 20_000_000), "cameras": Range(1, 1, 4), **_RUN, "beside": False},
     ),
-    "cloud-stream": _Benchmark(
+    "cloud-stream": (
         "clouds from a process of their own to clients in others",
-        {"clients": 4, "points": 50_000, "hz": 60, "mbit": 0.0, "seconds": 20.0, "seed": 0, "curve": False},
-        {"clients": (1, 16), "points": (1000, 1_000_000), "hz": (1, 120), "mbit": (0, 10_000)},
+        {
+            "clients": Range(4, 1, 16),
+            "points": Range(50_000, 1000, 1_000_000),
+            "hz": Range(60, 1, 120),
+            "mbit": Range(0.0, 0, 10_000),
+            **_RUN,
+            "curve": False,
+        },
     ),
-    "join": _Benchmark(
+    "join": (
         "a scene with large assets is prepared, fetched, verified and decoded",
-        {"objects": 300, "assets_mb": 200.0, "clients": 4, "seconds": 20.0, "seed": 0},
-        {**_CLIENTS, "objects": (1, 2000), "assets_mb": (1, 2000)},
+        {"objects": Range(300, 1, 2000), "assets_mb": Range(200.0, 1, 2000), "clients": Range(4, 1, 64), **_RUN},
     ),
-    "share": _Benchmark("what sharing adds to the steps of an environment", {"seconds": 100.0}, {}),
-    "stop": _Benchmark("how far an arm presses on after a hold", {"seconds": 1.0}, {}),
-    "hands": _Benchmark("how far faults of tracking move an arm", {"seconds": 300.0, "seed": 0}, {}),
-    "csharp": _Benchmark(
+    "share": ("what sharing adds to the steps of an environment", {"seconds": 100.0}),
+    "stop": ("how far an arm presses on after a hold", {"seconds": 1.0}),
+    "hands": ("how far faults of tracking move an arm", {"seconds": 300.0, "seed": 0}),
+    "csharp": (
         "the C# core of headset apps, on .NET and Mono",
-        {"bodies": 300, "points": 10_000, "seconds": 20.0, "seed": 0},
-        {**_BODIES, "points": (1000, 1_000_000)},
+        {"bodies": _BODIES, "points": Range(10_000, 1000, 1_000_000), **_RUN},
     ),
-    "record": _Benchmark(
+    "record": (
         "processor time and size of a recording, and what is left after kills",
-        {"seconds": 60.0, "kills": 21, "seed": 0},
-        {"kills": (1, 1000)},
+        {"seconds": 60.0, "kills": Range(21, 1, 1000), "seed": 0},
     ),
-    "export": _Benchmark(
+    "export": (
         "a data set is made of a recording with episodes, pictures drawn and encoded",
-        {"episodes": 20, "seconds": 20.0, "shadows": False, "jobs": 1, "python": ""},
-        {"episodes": (3, 10_000), "jobs": (1, 1024)},
+        {"episodes": Range(20, 3, 10_000), "seconds": 20.0, "shadows": False, "jobs": Range(1, 1, 1024), "python": ""},
     ),
     # A tab, one that is disturbed and one that is not; a gateway has three quarters of all connections.
-    "web": _Benchmark(
+    "web": (
         "browsers behind the web gateway, one of them a real tab",
-        {"clients": 8, "vertices": 10_000, "seconds": 65.0, "seed": 0, "curve": False, "tab": True},
-        {"clients": (3, 48), **_VERTICES},
+        {"clients": Range(8, 3, 48), "vertices": _VERTICES, "seconds": 65.0, "seed": 0, "curve": False, "tab": True},
     ),
 }
 _TEXTS: Final = {
@@ -123,51 +125,46 @@ _TEXTS: Final = {
     "curve": "encrypted and authenticated",
     "profile": "link profile of every client (docs/evidence/links.md); bars do not apply then",
 }
-#: What limits a number.
-_NOTES: Final = {("input", "operators"): ", one robot each", ("slow-client", "clients"): ", two of which are slow"}
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `bench`."""
-    parser = add_command(
+def register(commands: Commands) -> None:
+    names = add_actions(
         commands,
         "bench",
-        None,
+        metavar="NAME",
         help="run a benchmark and compare it with its bars",
         description="Measure with separate client processes. With --check, exit status 1 if a bar is missed. "
         "`iris-session bench NAME --help` has the options of one.",
-        examples="""
-            iris-session bench state --check
-            iris-session bench state --curve --json
-            iris-session bench input --operators 4 --robots 4 --seconds 10
-            iris-session bench state --profile busy-wifi
-            iris-session bench alignment --worlds W1,mixes --headsets 100 --json
-            iris-session bench cloud --beside --check
-            iris-session bench cloud-stream --points 50000 --hz 60 --check
-            iris-session bench record --seconds 20 --kills 4
-            iris-session bench web --clients 8 --curve --check
-        """,
     )
-    names = parser.add_subparsers(dest="bench", required=True, metavar="NAME")
-    for name, one in _BENCHMARKS.items():
-        _register_benchmark(names, name, one)
+    for name, (text, options) in BENCHMARKS.items():
+        parser = add_command(
+            names,
+            name,
+            run,
+            help=text,
+            description=f"Measure: {text}.",
+            examples=f"iris-session bench {name} --check",
+        )
+        for option, default in options.items():
+            _add_option(parser, option, default)
+        parser.add_argument("--check", action="store_true", help="exit status 1 if a bar is missed")
 
 
-def _register_benchmark(names: argparse._SubParsersAction[argparse.ArgumentParser], name: str, one: _Benchmark) -> None:
-    example = f"iris-session bench {name} --check"
-    parser = add_command(names, name, run, help=one.text, description=f"Measure: {one.text}.", examples=example)
-    for option, default in one.options.items():
-        flag = f"--{option.replace('_', '-')}"
-        if option == "tab":
-            parser.add_argument("--no-tab", dest="tab", action="store_false", help="no real browser, even if there is")
-        elif isinstance(default, bool):
-            parser.add_argument(flag, action="store_true", help=_TEXTS[option])
-        else:
-            kind = parse_seconds if option == "seconds" else type(default)
-            text = _TEXTS[option] + (" (default: %(default)s)" if default != "" else "")
-            parser.add_argument(flag, type=kind, default=default, help=text)
-    parser.add_argument("--check", action="store_true", help="exit status 1 if a bar is missed")
-    add_json_option(parser)
+def _add_option(parser: argparse.ArgumentParser, name: str, given: Range | float | str) -> None:
+    flag = f"--{name.replace('_', '-')}"
+    default = given.default if isinstance(given, Range) else given
+    if name == "tab":
+        parser.add_argument("--no-tab", dest="tab", action="store_false", help="no real browser, even if there is")
+        return
+    if isinstance(default, bool):
+        parser.add_argument(flag, action="store_true", help=_TEXTS[name])
+        return
+    parse: Callable[[str], Any] = parse_seconds if name == "seconds" else type(default)
+    if isinstance(given, Range):
+        wanted = f"a number that can be measured: give {given.low} to {given.high}"
+        parse = make_number_type(parse, wanted, given.low, given.high)
+    text = _TEXTS[name] + (" (default: %(default)s)" if default != "" else "")
+    parser.add_argument(flag, type=parse, default=default, help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -175,14 +172,16 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.bench.report import BenchError, measure_parallel_speed, read_stolen_time
     from iris_session.netsim.profiles import load_profile
 
-    name = arguments.bench.replace("-", "_")
+    name = arguments.action.replace("-", "_")
     function = getattr(importlib.import_module(f"iris_session.bench.{name}"), f"run_{name}")
-    options = _check_options(arguments)
+    options = {option: getattr(arguments, option) for option in BENCHMARKS[arguments.action][1]}
+    if options.get("operators", 0) > options.get("robots", 0):
+        raise CommandError(f"--operators {arguments.operators}: each drives a robot, there are {arguments.robots}")
     if options.get("profile"):
         load_profile(options["profile"])  # fails before anything is started
 
     def progress(text: str) -> None:
-        print(f"bench {arguments.bench}: {text}", file=sys.stderr, flush=True)
+        print(f"bench {arguments.action}: {text}", file=sys.stderr, flush=True)
 
     speed = measure_parallel_speed()
     stolen_s, all_s = read_stolen_time()
@@ -195,19 +194,3 @@ def run(arguments: argparse.Namespace) -> int:
     report = report.complete(arguments.bench, options, share, min(speed, measure_parallel_speed()))
     print_result(arguments, report.as_dict(), report.format().split("\n"))
     return 0 if report.ok or not arguments.check else 1
-
-
-def _check_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of the benchmark. Raises `CommandError` for a number that a scene or session cannot have."""
-    one = _BENCHMARKS[arguments.bench]
-    options = {name: getattr(arguments, name) for name in one.options}
-    limits = dict(one.limits)
-    if "operators" in options:
-        limits["operators"] = (1, arguments.robots)
-    for name, (low, high) in limits.items():
-        if not low <= options[name] <= high:
-            note = _NOTES.get((arguments.bench, name), "")
-            raise CommandError(
-                f"--{name.replace('_', '-')} {options[name]}: bench {arguments.bench} takes {low} to {high}{note}"
-            )
-    return options

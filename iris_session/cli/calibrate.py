@@ -24,9 +24,9 @@ from anchors.camera_calibration import (
 from anchors.pose import pose_to_dict
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
-    add_json_option,
     make_client,
     make_number_type,
     parse_length,
@@ -53,12 +53,6 @@ PICTURES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 COLUMNS: Final = "image,x,y,z,qw,qx,qy,qz"
 #: Time for a camera to give its frames [s].
 FRAMES_S: Final = 20.0
-#: Time for the session to name its anchors [s].
-ANCHORS_S: Final = 5.0
-#: Edge of the cells that ICP compares [m]: normals of smaller ones are noise.
-_ICP_VOXEL_M: Final = 0.02
-#: Error of a calibration that states none, 95 % [mm].
-_UNKNOWN_ERROR_MM: Final = 20.0
 
 
 # --- options of both --------------------------------------------------------------------------------------------------
@@ -150,8 +144,7 @@ def _list_poses(result: dict[str, Any]) -> list[tuple[str, dict[str, list[float]
 # --- anchors calibrate-camera -----------------------------------------------------------------------------------------
 
 
-def register_camera(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `calibrate-camera`."""
+def register_camera(actions: Commands) -> None:
     one = add_command(
         actions,
         "calibrate-camera",
@@ -171,25 +164,17 @@ def register_camera(actions: argparse._SubParsersAction[argparse.ArgumentParser]
     )
     one.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the pictures")
     _add_sheet_options(one, is_required=True, at="known pose of a sheet, T_base_sheet; repeatable")
-    one.add_argument(
-        "--intrinsics",
-        type=Path,
-        metavar="FILE",
-        help="TOML with width, height, fx, fy, cx, cy, distortion, or a 3x3 matrix as text "
-        "(default: intrinsics.toml or intrinsics.txt beside the pictures)",
+    text = (
+        "TOML with width, height, fx, fy, cx, cy, distortion, or a 3x3 matrix as text "
+        "(default: intrinsics.toml or intrinsics.txt beside the pictures)"
     )
+    one.add_argument("--intrinsics", type=Path, metavar="FILE", help=text)
     one.add_argument("--poses", type=Path, metavar="CSV", help="T_base_ee, pose of the robot's hand, per picture")
-    one.add_argument(
-        "--camera-on-hand", action="store_true", help="with --poses: the camera is on the hand, the sheet does not move"
-    )
-    one.add_argument(
-        "--in-hand",
-        type=parse_pose,
-        metavar="X,Y,Z,QW,QX,QY,QZ",
-        help="with --poses: known pose of the sheet on the hand, T_ee_sheet; one picture is enough",
-    )
+    text = "with --poses: the camera is on the hand, the sheet does not move"
+    one.add_argument("--camera-on-hand", action="store_true", help=text)
+    text = "with --poses: known pose of the sheet on the hand, T_ee_sheet; one picture is enough"
+    one.add_argument("--in-hand", type=parse_pose, metavar="X,Y,Z,QW,QX,QY,QZ", help=text)
     one.add_argument("--out", type=Path, metavar="FILE", help="also write the result as TOML")
-    add_json_option(one)
 
 
 def run_camera(arguments: argparse.Namespace) -> int:
@@ -202,17 +187,11 @@ def run_camera(arguments: argparse.Namespace) -> int:
         raise CommandError(str(error), status=1) from error
     if arguments.out is not None:
         write_file(arguments.out, calibration_to_toml(result))
-    print_result(arguments, result, format_calibration(result))
-    return 0
+    return print_result(arguments, result, format_calibration(result))
 
 
 def calibrate_cameras(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Calibrate cameras from pictures. Return the object that `--json` prints.
-
-    Raises:
-        CommandError: The options or files are unusable.
-        CalibrationError: The pictures do not determine a result.
-    """
+    """Calibrate cameras from pictures. Return the object that `--json` prints. Raises `CalibrationError`."""
     sheets = make_sheets(arguments.sheet)
     _check_options(arguments, sheets)
     if arguments.at:
@@ -341,8 +320,7 @@ class CameraFrames(NamedTuple):
     frames: list[DepthFrame]
 
 
-def register_depth_cameras(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `calibrate` of `cloud`."""
+def register_depth_cameras(actions: Commands) -> None:
     parser = add_command(
         actions,
         "calibrate",
@@ -364,13 +342,10 @@ def register_depth_cameras(actions: argparse._SubParsersAction[argparse.Argument
     _add_sheet_options(parser, is_required=False, at=at)
     add_address_options(parser, option=True)
     count = make_number_type(int, "a number of frames: give 1 to 200, for example 10", 1, 200)
-    parser.add_argument(
-        "--frames", type=count, default=10, metavar="N", help="frames per camera (default: %(default)s)"
-    )
+    parser.add_argument("--frames", type=count, default=10, metavar="N", help="frames per camera (%(default)s)")
     parser.add_argument("--icp", action="store_true", help="then fit several cameras to each other")
     parser.add_argument("--check", action="store_true", help="tell whether the poses of the camera file still fit")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the result as TOML, for the camera file")
-    add_json_option(parser)
 
 
 def run_depth_cameras(arguments: argparse.Namespace) -> int:
@@ -414,8 +389,7 @@ def run_depth_cameras(arguments: argparse.Namespace) -> int:
         is_beside = arguments.out.absolute().parent == arguments.file.absolute().parent
         name = json.dumps(arguments.out.name if is_beside else str(arguments.out.absolute()), ensure_ascii=False)
         lines.append(f"{arguments.out}: name it in each camera of {arguments.file}: calibration = {name}")
-    print_result(arguments, result, lines)
-    return 0
+    return print_result(arguments, result, lines)
 
 
 def _print_check(arguments: argparse.Namespace, settings: CloudSettings, placed: Mapping[str, PlacedCamera]) -> int:
@@ -425,7 +399,7 @@ def _print_check(arguments: argparse.Namespace, settings: CloudSettings, placed:
     cameras: dict[str, dict[str, Any]] = {}
     for camera in settings.cameras:
         assert camera.pose is not None  # the camera file was checked
-        error_mm = _UNKNOWN_ERROR_MM if camera.error_mm is None else camera.error_mm
+        error_mm = 20.0 if camera.error_mm is None else camera.error_mm  # 95 %
         one = check_pose(camera.pose.to_matrix(), 1e-3 * error_mm, placed[camera.name])
         cameras[camera.name] = {
             "fits": one.fits,
@@ -441,23 +415,17 @@ def _print_check(arguments: argparse.Namespace, settings: CloudSettings, placed:
         f"errors explain {found['limit_mm']:.1f} mm"
         for name, found in cameras.items()
     )
-    print_result(arguments, {"ok": is_well, "cameras": cameras}, lines)
-    return 0 if is_well else 1
+    return print_result(arguments, {"ok": is_well, "cameras": cameras}, lines, ok=is_well)
 
 
 def _find_known_sheets(arguments: argparse.Namespace) -> KnownSheets:
-    """Return the sheets of the options, or those of the session."""
+    """Return the sheets of the options; without `--at` also the anchors of the session, where it joins as observer."""
     sheets = make_sheets(arguments.sheet)
-    if not arguments.at:
-        return _ask_session(arguments, sheets)
-    _check_known_sheets(arguments.at, sheets)
-    return KnownSheets(sheets, dict(arguments.at), {})
-
-
-def _ask_session(arguments: argparse.Namespace, sheets: list[Sheet]) -> KnownSheets:
-    """Join as an observer for the poses and sizes of the anchors. `sheets`: further ones, at unknown poses."""
+    if arguments.at:
+        _check_known_sheets(arguments.at, sheets)
+        return KnownSheets(sheets, dict(arguments.at), {})
     with make_client(arguments, "observer", "cloud calibrate") as client:
-        client.wait_for(lambda one: one.mirror.synced, ANCHORS_S)
+        client.wait_for(lambda one: one.mirror.synced, 5.0)
         anchors = [one for one in client.mirror.anchors.values() if one.size_m > 0.0]
     if not anchors:
         raise CommandError(
@@ -498,14 +466,9 @@ def _take_frames(camera: CameraSettings, n: int) -> CameraFrames:
 def calibrate(
     settings: CloudSettings, taken: list[CameraFrames], known: KnownSheets, *, icp: bool = False
 ) -> tuple[dict[str, Any], dict[str, PlacedCamera]]:
-    """Solve the poses of cameras by the sheets in their frames.
+    """Solve the poses of cameras by the sheets in their frames. Raises `CalibrationError`.
 
-    Returns:
-        The object that `--json` prints, and the cameras by name, before ICP.
-
-    Raises:
-        CommandError: The frames are not of the size of the intrinsics.
-        CalibrationError: The frames do not determine the poses.
+    Return the object that `--json` prints, and the cameras by name, before ICP.
     """
     from anchors.camera import pose_to_matrix
     from anchors.depth_calibration import PlacedCamera, compute_points_error
@@ -519,7 +482,8 @@ def calibrate(
     placed = {}
     for one in taken:
         name = one.settings.name
-        T, covariance = pose_to_matrix(_read_pose(cameras[name]["T_base_camera"])), covariances[name]
+        pose, covariance = cameras[name]["T_base_camera"], covariances[name]
+        T = pose_to_matrix((tuple(pose["position_m"]), tuple(pose["quaternion_wxyz"])))
         points = _make_points(settings, one, T)
         error_m = math.hypot(compute_points_error(covariance, T, points), sheet_m)
         cameras[name]["error_mm_p95"] = 1e3 * error_m
@@ -548,7 +512,7 @@ def _make_points(settings: CloudSettings, one: CameraFrames, T_world_camera: Flo
     from iris_session.cloud.pipeline import make_limits
     from iris_session.cloud.voxels import MIN_AROUND, MIN_POINTS, VoxelFilter, make_rays
 
-    voxels = VoxelFilter(_ICP_VOXEL_M)
+    voxels = VoxelFilter(0.02)  # ICP compares their normals; those of smaller cells are noise
     limits = make_limits(settings, one.settings)
     rays = make_rays(one.camera)
     for frame in one.frames:
@@ -587,11 +551,6 @@ def _fit_cameras(cameras: dict[str, Any], placed: Mapping[str, PlacedCamera], sh
             "condition": one.condition,
         }
     return {"reference": first, "cameras": found}
-
-
-def _read_pose(value: dict[str, list[float]]) -> PoseTuple:
-    (x, y, z), (w, i, j, k) = value["position_m"], value["quaternion_wxyz"]
-    return (x, y, z), (w, i, j, k)
 
 
 def _format_icp(result: dict[str, Any]) -> Iterator[str]:

@@ -18,15 +18,18 @@ from typing import TYPE_CHECKING, Any, Final
 from iris_session.cli import calibrate
 from iris_session.cli.common import (
     CommandError,
+    Commands,
+    add_actions,
     add_address_options,
     add_command,
-    add_json_option,
+    handling_signals,
     make_client,
     parse_seconds,
     print_error,
     print_json,
     print_result,
     to_printable,
+    write_file,
 )
 from iris_session.protocol.errors import IrisError
 from iris_session.protocol.names import MediaEncoding, Role
@@ -37,45 +40,31 @@ if TYPE_CHECKING:
     from iris_session.cloud.config import CameraReport
     from iris_session.cloud.worker import CloudWorker
 
-#: Time for a camera to warm up before `inspect` measures, at most [s].
-FIRST_FRAME_S: Final = 10.0
-#: Time for the session to tell us its streams [s].
-STREAMS_S: Final = 5.0
 #: Without a terminal, a line of `run` that is like the one before is printed this often [s].
 QUIET_S: Final = 10.0
 log = logging.getLogger(__name__)
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `cloud` with its actions."""
-    parser = add_command(
+def register(commands: Commands) -> None:
+    actions = add_actions(
         commands,
         "cloud",
-        None,
         help="point clouds of depth cameras: run, example, inspect, calibrate",
         description="Show what depth cameras see as a point cloud in a session. `serve --camera FILE` does so by "
         "itself for cameras at its machine.",
-        examples="""
-            iris-session cloud example -o camera.toml           a commented camera file, to be edited
-            iris-session cloud calibrate camera.toml --out calibration.toml   poses of the cameras, by printed sheets
-            iris-session cloud inspect camera.toml              rate, points, faults, without a session
-            iris-session serve scene.xml --camera camera.toml   the cloud in a session of this machine
-            iris-session cloud run camera.toml --address 192.168.1.20   in a session of another machine
-            iris-session cloud inspect 192.168.1.20             what arrives here, and how old it is
-        """,
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _register_run(actions)
     _register_example(actions)
     _register_inspect(actions)
     calibrate.register_depth_cameras(actions)
 
 
-def _register_run(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_run(actions: Commands) -> None:
     parser = add_command(
         actions,
         "run",
         run_file,
+        has_json=False,
         help="publish the cloud of a camera file in a session",
         description="Publish the cloud and the pictures of a camera file in a session until Ctrl-C. At an encrypted "
         "session the key of this user must be allowed in role camera: `iris-session pair --role camera` there.",
@@ -91,27 +80,25 @@ def _register_run(actions: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--json", action="store_true", help="one JSON object per second")
 
 
-def _register_example(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_example(actions: Commands) -> None:
     from iris_session.cloud.example import SOURCES
 
     parser = add_command(
         actions,
         "example",
         run_example,
-        help="print a commented camera file",
-        description="Print a commented camera file, to be edited.",
+        has_json=False,
+        help="print a commented camera file, to be edited",
         examples="""
             iris-session cloud example > camera.toml
             iris-session cloud example --source realsense -o camera.toml
         """,
     )
-    parser.add_argument(
-        "--source", choices=sorted(SOURCES), default="folder", help="what the frames come from (default: %(default)s)"
-    )
+    parser.add_argument("--source", choices=sorted(SOURCES), default="folder", help="source of frames (%(default)s)")
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write it to a file that does not exist yet")
 
 
-def _register_inspect(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_inspect(actions: Commands) -> None:
     parser = add_command(
         actions,
         "inspect",
@@ -129,7 +116,6 @@ def _register_inspect(actions: argparse._SubParsersAction[argparse.ArgumentParse
     parser.add_argument("target", nargs="?", default="", metavar="FILE", help="camera file")
     add_address_options(parser, option=True)
     parser.add_argument("--seconds", type=parse_seconds, default=3.0, help="time to measure (default: %(default)s)")
-    add_json_option(parser)
 
 
 # --- run --------------------------------------------------------------------------------------------------------------
@@ -146,7 +132,9 @@ def run_file(arguments: argparse.Namespace) -> int:
     lower_thread_priority()
     seconds = math.inf if arguments.seconds is None else arguments.seconds
     printer = _ReportPrinter(as_json=arguments.json)
-    with _catch_signals() as ending, _name_unexpected_error(settings):
+    ending = threading.Event()  # a driver is not interrupted in the middle of its work
+    catching = handling_signals(lambda *_: ending.set(), signal.SIGINT, signal.SIGTERM)
+    with catching, _name_unexpected_error(settings):
         fault = run_cameras(settings, client, printer, lambda: ending.is_set() or printer.passed_s >= seconds)
         if not (fault or printer.was_connected or ending.is_set()):
             where = arguments.address or arguments.session or "of this machine"
@@ -155,18 +143,6 @@ def run_file(arguments: argparse.Namespace) -> int:
     if fault:
         print_error(fault)
     return 1 if fault else 0
-
-
-@contextmanager
-def _catch_signals() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C and SIGTERM set, instead of interrupting a driver in the middle of its work."""
-    ending = threading.Event()
-    before = {one: signal.signal(one, lambda *_: ending.set()) for one in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield ending
-    finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
 
 
 @contextmanager
@@ -250,13 +226,9 @@ def run_example(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         sys.stdout.write(text)
         return 0
-    try:
-        with arguments.out.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise CommandError(f"{arguments.out} exists: give another file, or remove it first") from None
-    except OSError as error:
-        raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from None
+    if arguments.out.exists():
+        raise CommandError(f"{arguments.out} exists: give another file, or remove it first")
+    write_file(arguments.out, text)
     print(f"{arguments.out}: edit it, then `iris-session cloud inspect {arguments.out}`")
     return 0
 
@@ -301,15 +273,16 @@ def _inspect_file(arguments: argparse.Namespace, path: Path) -> int:
         worker = CloudWorker(settings, _NoSink(), open_source, time.perf_counter_ns)
         worker.start()
         try:
-            _run_worker(worker, FIRST_FRAME_S, lambda: worker.cloud is not None)
+            _run_worker(worker, 10.0, lambda: worker.cloud is not None)  # a camera warms up
             worker.make_report()  # its rates begin here
             _run_worker(worker, arguments.seconds, lambda: False)
             report = worker.make_report()
         finally:
             worker.close()
     is_well = report.hz > 0.0 and not format_faults(report)
-    print_result(arguments, {"ok": is_well, **msgspec.to_builtins(report)}, format_inspection(settings, report))
-    return 0 if is_well else 1
+    return print_result(
+        arguments, {"ok": is_well, **msgspec.to_builtins(report)}, format_inspection(settings, report), ok=is_well
+    )
 
 
 def _run_worker(worker: CloudWorker, seconds: float, is_done: Any) -> None:
@@ -358,7 +331,7 @@ def _inspect_session(arguments: argparse.Namespace) -> int:
             budget = client.media.delivery
             return [] if budget is None else [one.stream for one in budget.streams if one.encoding in shown]
 
-        client.wait_for(lambda _: bool(list_streams()), STREAMS_S)
+        client.wait_for(lambda _: bool(list_streams()), 5.0)
         meters = [StreamMeter(client, stream, time.monotonic_ns()) for stream in list_streams()]
         until = time.monotonic() + arguments.seconds
         while meters and time.monotonic() < until:
@@ -369,8 +342,7 @@ def _inspect_session(arguments: argparse.Namespace) -> int:
     is_well = bool(found) and all(one.frames and not one.fault and not one.stale for one in found)
     none = "the session has no cloud: `iris-session serve --camera FILE`, or `iris-session cloud run FILE`"
     lines = [line for one in found for line in _format_stream(one)] or [none]
-    print_result(arguments, {"ok": is_well, "streams": found}, lines)
-    return 0 if is_well else 1
+    return print_result(arguments, {"ok": is_well, "streams": found}, lines, ok=is_well)
 
 
 def _format_stream(one: StreamMeasurement) -> Iterator[str]:

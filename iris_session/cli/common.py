@@ -10,11 +10,11 @@ import re
 import signal
 import socket
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar
 
 from anchors.pose import quat_normalize
 from iris_session.protocol.errors import IrisError
@@ -26,19 +26,18 @@ if TYPE_CHECKING:
     from iris_session.client import Client
     from iris_session.demo.named_scenes import NamedScene
     from iris_session.protocol.server_messages import ParticipantInfo
+    from iris_session.security import RegisteredSession
 
 N = TypeVar("N", int, float)
+Commands: TypeAlias = "argparse._SubParsersAction[CommandParser]"
 
 #: Bytes of each unit of a size.
 _BYTES: Final = {
     f"{letter}{i}b": base**n for n, letter in enumerate("kmgt", 1) for i, base in (("", 1000), ("i", 1024))
 }
-#: The least number above 0.
 ABOVE_0: Final = math.ulp(0.0)
 #: Lines of one kind that are printed; `--json` has all.
 MOST_LINES: Final = 20
-#: Timeout of the test whether a session is reachable [s].
-CONNECT_S: Final = 2.0
 
 
 class CommandError(IrisError):
@@ -49,34 +48,39 @@ class CommandError(IrisError):
         self.status = status
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn an `OSError` into a `CommandError` about a file that cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise CommandError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
 def write_file(path: Path, content: bytes | str) -> None:
     """Write the file of an option, completely or not at all. Raises `CommandError`."""
-    try:
+    with writing(path):
         write_output(path, content.encode() if isinstance(content, str) else content)
-    except OSError as error:
-        raise CommandError(f"{path} cannot be written: {error.strerror}") from error
 
 
 @contextmanager
-def ending_as_interrupts() -> Iterator[None]:
-    """Take SIGTERM and a closed terminal as Ctrl-C, so that nothing is left behind."""
-    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGTERM, signal.SIGHUP)}
+def handling_signals(handler: Callable[[int, FrameType | None], Any], *numbers: signal.Signals) -> Iterator[None]:
+    """Handle signals while the block runs."""
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, previous in before.items():
+            signal.signal(number, previous)
+
+
+def ending_as_interrupts() -> AbstractContextManager[None]:
+    """Take SIGTERM and a closed terminal as Ctrl-C while the block runs, so that nothing is left behind."""
+    return handling_signals(signal.default_int_handler, signal.SIGTERM, signal.SIGHUP)
 
 
 def make_number_type(kind: Callable[[str], N], wanted: str, low: float, high: float = math.inf) -> Callable[[str], N]:
-    """Return a type for `add_argument`: finite numbers from `low` to `high`.
-
-    Args:
-        kind: `float` or `int`.
-        wanted: What it is and what to give, for the error.
-        low: Least number.
-        high: Greatest number.
-    """
+    """Return a type for `add_argument`: finite numbers from `low` to `high`. `wanted`: what to give, for the error."""
 
     def parse(text: str) -> N:
         with suppress(ValueError):
@@ -88,8 +92,10 @@ def make_number_type(kind: Callable[[str], N], wanted: str, low: float, high: fl
     return parse
 
 
-#: Types of options: a duration [s], and `--port-base`.
+#: Types of options: a duration [s], ports, and `--port-base`.
 parse_seconds: Final = make_number_type(float, "a duration: give seconds above 0, for example 30", ABOVE_0)
+parse_port: Final = make_number_type(int, "a port: give 1 to 65535", 1, 65535)
+parse_free_port: Final = make_number_type(int, "a port: give 1 to 65535, or 0 for any free one", 0, 65535)
 parse_port_base: Final = make_number_type(int, "a base of seven ports: give 1 to 65529, for example 7730", 1, 65529)
 
 
@@ -117,41 +123,81 @@ def parse_budget(text: str) -> int:
     return n_bytes
 
 
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose errors are one line, and whose help ends with examples: its own, or the first of each action."""
+
+    notes = ""
+    examples: Sequence[str] = ()
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **options)
+        self._negative_number_matcher = re.compile(r"-[0-9.][^,]*(,.*)?")  # a pose that begins with a minus, too
+
+    def list_examples(self) -> Sequence[str]:
+        """Return the examples of its help."""
+        lists = (action.choices.values() for action in self._actions if isinstance(action, argparse._SubParsersAction))
+        return self.examples or [one.list_examples()[0].split("  ")[0] for parsers in lists for one in parsers]
+
+    def format_help(self) -> str:
+        """Return the help."""
+        lines = self.list_examples()
+        title = "examples" if len(lines) > 1 else "example"
+        self.epilog = f"{self.notes}\n\n" * bool(self.notes) + "\n  ".join((f"{title}:", *lines))
+        return super().format_help()
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit with 2; `--help` has the usage."""
+        for action in self._actions:
+            name = action.metavar or action.dest
+            if action.choices and not action.option_strings and message.endswith(f"arguments are required: {name}"):
+                message += f", one of {', '.join(action.choices)}"
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
 def add_command(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    commands: Commands,
     name: str,
-    run: Callable[[argparse.Namespace], int] | None,
+    run: Callable[[argparse.Namespace], int],
     *,
     help: str,
-    description: str,
+    description: str = "",
     examples: str,
     notes: str = "",
-) -> argparse.ArgumentParser:
-    """Add a command, or an action of one.
+    has_json: bool = True,
+) -> CommandParser:
+    """Add a command, or an action of one, and return its parser.
 
     Args:
         commands: Commands or actions to add it to.
         name: Its name.
-        run: Function that runs it and returns the exit status; `None` for a command that has actions.
+        run: Function that runs it and returns the exit status.
         help: Its line in the list of commands.
-        description: What it does, at the top of its help.
+        description: What it does, at the top of its help (default: `help`).
         examples: Examples, one a line, at the end of its help; may be indented.
         notes: Text before the examples.
-
-    Returns:
-        The parser, for its options.
+        has_json: Add `--json`, which `print_result` obeys.
     """
-    lines = inspect.cleandoc(examples).split("\n")
-    title = "examples" if len(lines) > 1 else "example"
-    epilog = f"{notes}\n\n" * bool(notes) + "\n  ".join((f"{title}:", *lines))
-    form = argparse.RawDescriptionHelpFormatter
-    parser = commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=form)
-    if run is not None:
-        parser.set_defaults(run=run)
+    parser = _add_parser(commands, name, help, description)
+    parser.notes, parser.examples = notes, inspect.cleandoc(examples).split("\n")
+    parser.set_defaults(run=run)
+    if has_json:
+        add_json_option(parser)
     return parser
 
 
-def add_json_option(parser: argparse.ArgumentParser) -> None:
+def add_actions(
+    commands: Commands, name: str, *, help: str, description: str = "", metavar: str = "ACTION"
+) -> Commands:
+    """Add a command that has actions, and return them. `help`, `description`: as of `add_command`."""
+    parser = _add_parser(commands, name, help, description)
+    return parser.add_subparsers(dest="action", required=True, metavar=metavar)
+
+
+def _add_parser(commands: Commands, name: str, help: str, description: str) -> CommandParser:
+    return commands.add_parser(name, help=help, description=description or f"{help[0].upper()}{help[1:]}.")
+
+
+def add_json_option(parser: argparse._ActionsContainer) -> None:
     """Add `--json`."""
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 
@@ -162,13 +208,7 @@ def add_address_options(
     option: bool = False,
     code: str = "join code, needed the first time at an encrypted session",
 ) -> None:
-    """Add the options by which a client finds a session: `--address`, `--session`, `--code`.
-
-    Args:
-        parser: Parser of the command.
-        option: Take the address by its option only, because the command has other positional arguments.
-        code: Help text of `--code`.
-    """
+    """Add the options by which a client finds a session. `option`: the address is no positional argument."""
     text = "HOST:PORT or iris://... (default: 127.0.0.1:7721)"
     parser.add_argument("--address", default="", metavar="ADDR", help=text)
     if not option:
@@ -178,26 +218,15 @@ def add_address_options(
 
 
 def check_session_reachable(arguments: argparse.Namespace) -> None:
-    """Raise `CommandError` within `CONNECT_S` if nothing listens at the given address.
-
-    A client would wait for the session to start. A session given by name is not checked: it has no address yet.
-    """
-    from iris_session.client.discovery import Address, resolve_host
+    """Raise `CommandError` if nothing listens at the given address: a client would wait for the session to start."""
+    from iris_session.client.discovery import Address
     from iris_session.client.endpoint_resolver import LOCAL_ADDRESS
 
-    if arguments.session:
+    if arguments.session:  # found by its name, it has no address yet
         return
     address = Address.parse(arguments.address or LOCAL_ADDRESS)
-    until_s = time.monotonic() + CONNECT_S
-    resolving = resolve_host(address.host, until_s)
     try:
-        while True:
-            try:
-                next(resolving)
-            except StopIteration as found:
-                socket.create_connection((found.value, address.port), max(0.1, until_s - time.monotonic())).close()
-                return
-            time.sleep(0.005)
+        socket.create_connection((address.host, address.port), 2.0).close()  # [s]
     except OSError as error:
         raise CommandError(
             f"no session answers at {address}: is `iris-session serve` running there? "
@@ -207,11 +236,7 @@ def check_session_reachable(arguments: argparse.Namespace) -> None:
 
 
 def make_client(arguments: argparse.Namespace, role: str, name: str) -> Client:
-    """Return a client, not connected yet, for the options of `add_address_options`.
-
-    Raises:
-        CommandError: Nothing listens at the address.
-    """
+    """Return a client, not connected yet, for the options of `add_address_options`. Raises `CommandError`."""
     from iris_session.client import Client
 
     check_session_reachable(arguments)
@@ -221,12 +246,15 @@ def make_client(arguments: argparse.Namespace, role: str, name: str) -> Client:
     )
 
 
-def find_participant(client: Client, name: str) -> ParticipantInfo:
-    """Return the participant with an id or name.
+def refuse_options(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Raise `CommandError` if some of these options are given: their list, then `why`."""
+    given = ", ".join(f"--{name}" for name in names if getattr(arguments, name))
+    if given:
+        raise CommandError(f"{given}{why}")
 
-    Raises:
-        CommandError: No participant, or more than one, has that name. The text lists the candidates.
-    """
+
+def find_participant(client: Client, name: str) -> ParticipantInfo:
+    """Return the participant with an id or name. Raises `CommandError` with the candidates if it is none, or many."""
     people = sorted(client.mirror.participants.values(), key=lambda one: (len(one.id), one.id))
     found = [one for one in people if one.id == name] or [one for one in people if one.name == name]
     if len(found) == 1:
@@ -238,115 +266,83 @@ def find_participant(client: Client, name: str) -> ParticipantInfo:
     raise CommandError(to_printable(f"no participant {name!r} in the session; there are: {others}"))
 
 
-def describe_own_sessions() -> str:
-    """Return the addresses of this user's encrypted sessions, for errors of commands without an address."""
+def _read_own_sessions() -> Sequence[RegisteredSession]:
+    """Return the encrypted sessions of this user that run here."""
     from iris_session.security import KeyHome, KeysError
 
-    try:
-        notes = KeyHome().sessions.read()
-    except KeysError:
-        notes = []
-    yours = (f"; your session {one.name!r} is at {one.hosts[0]}:{one.control}" for one in notes if one.hosts)
+    with suppress(KeysError):
+        return KeyHome().sessions.read()
+    return ()
+
+
+def describe_own_sessions() -> str:
+    """Return the addresses of this user's encrypted sessions, for errors of commands without an address."""
+    yours = (f"; your session {x.name!r} is at {x.hosts[0]}:{x.control}" for x in _read_own_sessions() if x.hosts)
     return "".join(yours) or "; for a session on another machine, give its address or --session NAME"
 
 
 def describe_error(error: IrisError) -> str:
     """Return an error as a line: of a key that is not on the list, with what the owner of a session here does."""
-    from iris_session.security import KeyHome, KeysError
-
-    try:
-        owns = getattr(error, "code", "") == RefusalCode.UNPAIRED and bool(KeyHome().sessions.read())
-    except KeysError:
-        owns = False
+    owns = getattr(error, "code", "") == RefusalCode.UNPAIRED and _read_own_sessions()
     return f"{error}{'; if the session is your own: `iris-session keys allow me`' if owns else ''}"
 
 
 def add_session_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of commands that open a session."""
+    """Add the options of commands that open a session. Most are stored under the name of a field of `SessionConfig`,
+    and are `None` if not given.
+    """
     group = parser.add_argument_group("session")
     group.add_argument("--name", help="name of the session (default: that of the scene)")
-    group.add_argument(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDR",
-        help="address to listen on, 0.0.0.0 for all (default: %(default)s)",
-    )
-    group.add_argument(
-        "--interface",
-        action="append",
-        default=[],
-        metavar="NAME_OR_ADDR",
-        help="network to listen on instead of --host: a name like eth0, or an address; repeatable",
-    )
-    group.add_argument(
-        "--advertise",
-        default="",
-        metavar="ADDR",
-        help="address announced to clients, behind a router that forwards ports",
-    )
-    group.add_argument(
-        "--port-base",
-        type=parse_port_base,
-        metavar="N",
-        help="block of ports: introduction N, control N+1, state N+2, ... N+6 (default: 7720)",
-    )
-    group.add_argument("--no-beacon", action="store_true", help="do not announce the session on the network")
+    group.add_argument("--host", metavar="ADDR", help="address to listen on, 0.0.0.0 for all (default: 127.0.0.1)")
+    text = "network to listen on instead of --host: a name like eth0, or an address; repeatable"
+    group.add_argument("--interface", dest="interfaces", action="append", metavar="NAME_OR_ADDR", help=text)
+    group.add_argument("--advertise", metavar="ADDR", help="address for clients, if a router forwards our ports")
+    text = "block of ports: introduction N, control N+1, state N+2, ... N+6 (default: 7720)"
+    group.add_argument("--port-base", type=parse_port_base, metavar="N", help=text)
+    text = "do not announce the session on the network"
+    group.add_argument("--no-beacon", dest="beacon_port", action="store_const", const=0, help=text)
     group.add_argument("--control-port", type=int, metavar="PORT", help="0: any free port")
     group.add_argument("--state-port", type=int, metavar="PORT", help="0: any free port")
     group.add_argument("--curve", action="store_true", help="encrypt on loopback too, and admit listed keys only")
-    group.add_argument(
-        "--curve-key",
-        default="",
-        metavar="FILE",
-        help="secret key of the session for encryption, a ZeroMQ certificate *.key_secret that only you can read "
-        "(default: your own, made on first use; `iris-session keys show` has its fingerprint)",
+    text = (
+        "secret key of the session for encryption, a ZeroMQ certificate *.key_secret that only you can read "
+        "(default: your own, made on first use; `iris-session keys show` has its fingerprint)"
     )
-    group.add_argument("--record", metavar="FILE", help="path of the recording (default: below sessions/)")
-    group.add_argument(
-        "--record-clouds",
-        type=parse_cloud_rate,
-        metavar="RATE",
-        help="frames per second of each point cloud and picture in the recording, or off (default: 2Hz)",
+    group.add_argument("--curve-key", metavar="FILE", help=text)
+    record = group.add_mutually_exclusive_group()
+    text = "path of the recording (default: below sessions/)"
+    record.add_argument("--record", type=parse_recording_name, metavar="FILE", help=text)
+    record.add_argument("--no-record", dest="record", action="store_const", const=False, help="record nothing")
+    text = "frames per second of each point cloud and picture in the recording, or off (default: 2Hz)"
+    group.add_argument("--record-clouds", dest="record_clouds_hz", type=parse_cloud_rate, metavar="RATE", help=text)
+    text = (
+        "what of the scenes goes into the recording: what the best level of detail needs (scene), all levels, or "
+        "nothing (default: scene)"
     )
-    group.add_argument(
-        "--record-assets",
-        choices=("none", "scene", "all"),
-        help="what of the scenes goes into the recording: what the best level of detail needs (scene), all levels, or "
-        "nothing (default: scene)",
+    group.add_argument("--record-assets", choices=("none", "scene", "all"), help=text)
+    text = "size that the recording may have, such as 20GB; the session goes on without one then (default: no limit)"
+    group.add_argument("--record-budget", dest="record_budget_bytes", type=parse_budget, metavar="SIZE", help=text)
+    text = (
+        "folder of public ZeroMQ certificates *.key: these keys may join, in every role, and no other; there is "
+        "no pairing and no page then (default: the keys of `iris-session keys list`)"
     )
-    group.add_argument(
-        "--record-budget",
-        type=parse_budget,
-        metavar="SIZE",
-        help="size that the recording may have, such as 20GB; the session goes on without one then (default: no limit)",
-    )
-    group.add_argument(
-        "--curve-clients",
-        default="",
-        metavar="DIR",
-        help="folder of public ZeroMQ certificates *.key: these keys may join, in every role, and no other; there is "
-        "no pairing and no page then (default: the keys of `iris-session keys list`)",
-    )
-    add_page_options(group)
-    group.add_argument("--no-record", action="store_true", help="record nothing")
+    group.add_argument("--curve-clients", metavar="DIR", help=text)
+    add_page_options(group, parse_free_port)
     group.add_argument("--view", action="store_true", help="show the recording in Rerun's viewer while it is written")
-    group.add_argument("--no-web", action="store_true", help="serve no page for browsers")
-    group.add_argument(
-        "--groups",
-        type=parse_groups,
-        metavar="GROUPS",
-        help="geom groups that clients show, such as 0,1,2 (default: as the model's own viewer)",
-    )
-    group.add_argument(
-        "--sites",
-        nargs="?",
-        const=True,
-        type=parse_sites,
-        metavar="GROUPS",
-        help="show all sites, those of these groups, or `none` (default: groups 0 to 2, as MuJoCo's viewer)",
-    )
+    group.add_argument("--no-web", dest="web", action="store_false", help="serve no page for browsers")
+    text = "geom groups that clients show, such as 0,1,2 (default: as the model's own viewer)"
+    group.add_argument("--groups", type=parse_groups, metavar="GROUPS", help=text)
+    text = "show all sites, those of these groups, or `none` (default: groups 0 to 2, as MuJoCo's viewer)"
+    group.add_argument("--sites", nargs="?", const=True, type=parse_sites, metavar="GROUPS", help=text)
     group.add_argument("--assignment", choices=sorted(AssignmentPolicy.ALL), help="how robots are assigned")
     group.add_argument("--mode", choices=sorted(LeaseMode.ALL), help="lease mode of every robot")
+
+
+def parse_recording_name(text: str) -> str:
+    """Parse `--record`."""
+    if not text.endswith(".rrd"):
+        raise argparse.ArgumentTypeError(f"{text!r}: a recording is one file: give a name that ends in .rrd")
+    return text
 
 
 def parse_groups(text: str) -> tuple[int, ...]:
@@ -362,12 +358,10 @@ def parse_sites(text: str) -> bool | tuple[int, ...]:
     return text == "all" if text in ("all", "none") else parse_groups(text)
 
 
-def add_page_options(group: argparse._ActionsContainer) -> None:
-    """Add the options of the page for browsers, for `serve`, `demo` and `web`."""
-    group.add_argument("--web-port", type=int, metavar="PORT", help="port of the page for browsers (default: 7725)")
-    group.add_argument(
-        "--web-cert", default="", metavar="FILE", help="certificate for HTTPS, PEM (default: one of this user's own)"
-    )
+def add_page_options(group: argparse._ActionsContainer, port: Callable[[str], int]) -> None:
+    """Add the options of the page for browsers, for `serve`, `demo` and `web`. `port`: type of its port."""
+    group.add_argument("--web-port", type=port, metavar="PORT", help="port of the page for browsers (default: 7725)")
+    group.add_argument("--web-cert", default="", metavar="FILE", help="certificate for HTTPS, PEM (default: your own)")
     group.add_argument("--web-key", default="", metavar="FILE", help="key of that certificate, PEM")
 
 
@@ -404,12 +398,13 @@ def print_json(value: object) -> None:
     print(json.dumps(value, allow_nan=False, default=to_builtins), flush=True)
 
 
-def print_result(arguments: argparse.Namespace, value: object, lines: Iterable[str]) -> None:
-    """Print the result of a command: one JSON object for `--json`, else lines, made printable."""
+def print_result(arguments: argparse.Namespace, value: object, lines: Iterable[str], *, ok: bool = True) -> int:
+    """Print the result of a command, for `--json` one object, else printable lines. Return the exit status."""
     if arguments.json:
         print_json(value)
     else:
         print("\n".join(map(to_printable, lines)), flush=True)
+    return 0 if ok else 1
 
 
 def list_first(lines: Sequence[str], most: int = MOST_LINES) -> list[str]:
@@ -428,18 +423,16 @@ def print_error(text: str) -> None:
     print(to_printable(f"iris-session: {text}"), file=sys.stderr)
 
 
+def name_first(problems: Sequence[str]) -> str:
+    """Return the first problem, and how many more there are."""
+    return problems[0] + (f" (and {len(problems) - 1} more)" if len(problems) > 1 else "")
+
+
 def report_damage(path: Path, problems: Sequence[str]) -> int:
     """Print the first problem of a recording. Return the exit status."""
     if problems:
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        print_error(f"{path} is damaged: {problems[0]}{more}")
+        print_error(f"{path} is damaged: {name_first(problems)}")
     return 1 if problems else 0
-
-
-_UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-POSE_FORMAT: Final = "X,Y,Z,QW,QX,QY,QZ"
-#: Comma-separated numbers, the first negative: no option has this form.
-_BEGINS_WITH_MINUS: Final = re.compile(r"-[0-9.][^,]*(,[^,]*)+")
 
 
 def parse_pose(text: str) -> PoseTuple:
@@ -456,26 +449,10 @@ def parse_pose(text: str) -> PoseTuple:
     return (x, y, z), quat_normalize((q[0], q[1], q[2], q[3]))
 
 
-def join_negative_poses(arguments: Sequence[str]) -> list[str]:
-    """Join a pose that begins with a minus to its option, as `--pose=-1,...`: argparse would read it as an option."""
-    out: list[str] = []
-    for word in arguments:
-        if _BEGINS_WITH_MINUS.fullmatch(word) and out and out[-1].startswith("--") and "=" not in out[-1]:
-            out[-1] += f"={word}"
-        else:
-            out.append(word)
-    return out
-
-
 def add_pose_option(parser: argparse.ArgumentParser, description: str) -> None:
     """Add the required option `--pose`."""
-    parser.add_argument(
-        "--pose",
-        type=parse_pose,
-        required=True,
-        metavar=POSE_FORMAT,
-        help=f"{description}: metres, unit quaternion with w first",
-    )
+    text = f"{description}: metres, unit quaternion with w first"
+    parser.add_argument("--pose", type=parse_pose, required=True, metavar="X,Y,Z,QW,QX,QY,QZ", help=text)
 
 
 def parse_length(text: str) -> float:
@@ -483,4 +460,4 @@ def parse_length(text: str) -> float:
     match = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(mm|cm|m)", text.strip())
     if not match:
         raise argparse.ArgumentTypeError(f"{text!r} is not a length: give a number with its unit, for example 150mm")
-    return float(match[1]) * _UNITS[match[2]]
+    return float(match[1]) * {"mm": 1e-3, "cm": 1e-2, "m": 1.0}[match[2]]

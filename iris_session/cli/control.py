@@ -12,15 +12,16 @@ import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
-    add_json_option,
     describe_error,
     find_participant,
     make_client,
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
 
 #: Time to be admitted, and for the e-stop to be confirmed [s].
 TIMEOUT_S: Final = 5.0
-#: Time for the event of a change that was granted [s]: it comes just before the reply, if anything changed.
-NEWS_S: Final = 0.5
 #: Roles that may ask for it, the least powerful first: a key may have few of them.
 DIRECTORS: Final = (Role.DIRECTOR,)
 DRIVERS: Final = (Role.AGENT, Role.OPERATOR, Role.LEADER, Role.DIRECTOR)
@@ -53,89 +52,52 @@ Outcome = tuple[str, dict[str, Any]]
 Action = Callable[["Client", argparse.Namespace], Outcome]
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the commands `estop`, `clear-estop`, `pause`, `resume`, `reset`, `assign`, `release`, `mode`, `rename`,
-    `role`, `episode` and `marker`.
-    """
-    estop = _add_command(
-        commands,
-        "estop",
-        "stop every robot of a session; not a safety-rated stop",
-        stop_session,
-        'estop "hand in the way"',
-    )
+def register(commands: Commands) -> None:
+    add = partial(_add_command, commands)
+    estop = add("stop every robot of a session; not a safety-rated stop", stop_session, 'estop "hand in the way"')
     estop.add_argument("reason", nargs="*", help="text for participants and the recording")
     estop.set_defaults(roles=ALL_ROLES)
-    _add_command(
-        commands,
-        "clear-estop",
-        "allow motion again after an e-stop; says who had stopped",
-        clear_session,
-        "clear-estop",
-    )
-    for action, text in (
-        (ControlAction.PAUSE, "pause physics; robots hold"),
-        (ControlAction.RESUME, "continue paused physics"),
-        (ControlAction.RESET, "put the scene back to its initial state; leases stay"),
-    ):
-        _add_command(commands, action, text, control_physics, action).set_defaults(action=action)
-    assign = _add_command(
-        commands, "assign", "give robots to a participant", assign_robots, "assign left ann", "assign left,right p3"
-    )
+    add("allow motion again after an e-stop; says who had stopped", clear_session, "clear-estop")
+    add("pause physics; robots hold", control_physics, ControlAction.PAUSE)
+    add("continue paused physics", control_physics, ControlAction.RESUME)
+    add("put the scene back to its initial state; leases stay", control_physics, ControlAction.RESET)
+    person: dict[str, Any] = {"metavar": "PERSON", "help": "name or id of a participant"}
+    assign = add("give robots to a participant", assign_robots, "assign left ann", "assign left,right p3")
     assign.add_argument("robots", metavar="ROBOT[,ROBOT]", help="names of robots")
-    assign.add_argument("person", metavar="PERSON", help="name or id of a participant")
-    release = _add_command(
-        commands, "release", "free robots, whichever participant holds them", release_robots, "release left right"
-    )
+    assign.add_argument("person", **person)
+    release = add("free robots, whichever participant holds them", release_robots, "release left right")
     release.add_argument("robots", nargs="+", metavar="ROBOT", help="names of robots")
-    mode = _add_command(commands, "mode", "change the lease mode of robots", set_modes, "mode request left right")
+    mode = add("change the lease mode of robots", set_modes, "mode request left right")
     mode.add_argument("mode", choices=sorted(LeaseMode.ALL), help="lease mode")
     mode.add_argument("robots", nargs="*", metavar="ROBOT", help="names of robots (default: all)")
-    rename = _add_command(
-        commands, "rename", "give a participant another name", rename_participant, "rename p3 ann", "rename quest ann"
-    )
-    rename.add_argument("person", metavar="PERSON", help="name or id of a participant")
+    rename = add("give a participant another name", rename_participant, "rename p3 ann", "rename quest ann")
+    rename.add_argument("person", **person)
     rename.add_argument("name", metavar="NAME", help="its new name; one that is taken gets a number")
-    role = _add_command(
-        commands, "role", "give a participant another role, one of those of its key", set_role, "role ann director"
-    )
-    role.add_argument("person", metavar="PERSON", help="name or id of a participant")
+    role = add("give a participant another role, one of those of its key", set_role, "role ann director")
+    role.add_argument("person", **person)
     role.add_argument("role", choices=sorted(Role.ALL - {Role.GATEWAY}), metavar="ROLE", help="its new role")
-    episode = _add_command(
-        commands,
-        "episode",
-        "start and end episodes of training data",
-        control_episode,
-        "episode start --label pour",
-        "episode success",
-        "episode discard",
-        "episode take_over",
-    )
+    examples = ("episode start --label pour", "episode success", "episode discard", "episode take_over")
+    episode = add("start and end episodes of training data", control_episode, *examples)
     episode.add_argument("action", choices=sorted(EpisodeAction.ALL), help="what happens to the episode")
-    episode.set_defaults(roles=EPISODE_ROLES)
     episode.add_argument("--label", default="", help="free text about the episode")
     episode.add_argument("--countdown", type=float, metavar="S", help="seconds until `start` begins (default: 3)")
-    marker = _add_command(
-        commands, "marker", "put a note into the recording", place_marker, 'marker "gripper was cleaned"'
-    )
+    episode.set_defaults(roles=EPISODE_ROLES)
+    marker = add("put a note into the recording", place_marker, 'marker "gripper was cleaned"')
     marker.add_argument("text", nargs="+", help="the note")
     marker.set_defaults(roles=ALL_ROLES)
 
 
-def _add_command(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, text: str, act: Action, *examples: str
-) -> argparse.ArgumentParser:
+def _add_command(commands: Commands, text: str, act: Action, *examples: str) -> argparse.ArgumentParser:
+    """Add the command with which the first example begins."""
     parser = add_command(
         commands,
-        name,
+        examples[0].split(" ")[0],
         run,
         help=text,
-        description=f"{text[0].upper()}{text[1:]}. The session is the one on this machine, or that of --address or "
-        "--session.",
+        notes="The session is the one on this machine, or that of --address or --session.",
         examples="\n".join(f"iris-session {example}" for example in (*examples, f"{examples[0]} --session lab-1")),
     )
     add_address_options(parser, option=True)
-    add_json_option(parser)
     parser.set_defaults(act=act, roles=DIRECTORS)
     return parser
 
@@ -161,8 +123,7 @@ def run(arguments: argparse.Namespace) -> int:
             reason = denied or (error.code if isinstance(error, RefusedError) else "no_answer")
             print_json({**result, "ok": False, "reason": reason, "error": text})
         return error.status if isinstance(error, CommandError) else 1
-    print_result(arguments, result | fields, [text])
-    return 0
+    return print_result(arguments, result | fields, [text])
 
 
 @contextmanager
@@ -243,11 +204,11 @@ def clear_session(client: Client, _: argparse.Namespace) -> Outcome:
 
 def control_physics(client: Client, arguments: argparse.Namespace) -> Outcome:
     """Pause, resume or reset."""
-    client.control(arguments.action)
-    text = {"pause": "paused", "resume": "running", "reset": "reset to the initial state"}[arguments.action]
+    client.control(arguments.command)
+    text = {"pause": "paused", "resume": "running", "reset": "reset to the initial state"}[arguments.command]
     if client.mirror.estop:
         text += "; the e-stop is still active: clear-estop"
-    return text, {"action": arguments.action}
+    return text, {"action": arguments.command}
 
 
 def assign_robots(client: Client, arguments: argparse.Namespace) -> Outcome:
@@ -264,7 +225,7 @@ def rename_participant(client: Client, arguments: argparse.Namespace) -> Outcome
     person = find_participant(client, arguments.person).id
     before = client.mirror.participants[person].name
     client.request(Rename(0, person, arguments.name))
-    client.wait_for(lambda one: _find_name(one, person) != before, NEWS_S)
+    client.wait_for(lambda one: _find_name(one, person) != before, 0.5)  # it comes with the reply, if it changed
     name = _find_name(client, person)
     return f"{person}: {before} is now {name}", {"participant": person, "name": name}
 

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     add_session_options,
     make_number_type,
     open_scene,
     parse_seconds,
     print_result,
+    refuse_options,
 )
 from iris_session.cli.view import live_viewer
 
@@ -27,12 +28,7 @@ if TYPE_CHECKING:
     from iris_session.session.session import Session
 
 
-#: Options whose fields have another name, as `from` is a keyword.
-_FIELDS = {"from": "giver", "to": "receiver"}
-
-
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `demo`."""
+def register(commands: Commands) -> None:
     parser = add_command(
         commands,
         "demo",
@@ -64,41 +60,20 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument("scene", nargs="?", help="for handover: your scene, a file or a name as of `serve`")
     plan = parser.add_argument_group("handover in your scene")
     plan.add_argument("--object", default="", metavar="NAME", help="the object (default: the only free body)")
-    plan.add_argument("--from", dest="giver", default="", metavar="ROBOT", help="who gives (default: the nearest)")
-    plan.add_argument("--to", dest="receiver", default="", metavar="ROBOT", help="who takes (default: the other)")
-    plan.add_argument(
-        "--episodes",
-        type=make_number_type(int, "a number of handovers: give 1 to 1000", 1, 1000),
-        default=1,
-        metavar="N",
-        help="handovers; with several the object lies a little elsewhere in each (default: 1)",
-    )
-    parser.add_argument(
-        "--operators", type=int, default=2, metavar="N", help="operators, in pairs; 2 to 8 (default: 2)"
-    )
+    plan.add_argument("--from", default="", metavar="ROBOT", help="who gives (default: the nearest)")
+    plan.add_argument("--to", default="", metavar="ROBOT", help="who takes (default: the other)")
+    text = "handovers; with several the object lies a little elsewhere in each (default: 1)"
+    count = make_number_type(int, "a number of handovers: give 1 to 1000", 1, 1000)
+    plan.add_argument("--episodes", type=count, metavar="N", help=text)
+    parser.add_argument("--operators", type=int, default=2, metavar="N", help="operators in pairs, 2 to 8 (default: 2)")
     parser.add_argument("--observers", type=int, default=0, metavar="N", help="observers; 0 to 16 (default: 0)")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the emulated operators")
-    parser.add_argument(
-        "--timeout",
-        type=parse_seconds,
-        metavar="S",
-        help="stop after this many seconds (default: 150, and 60 for each further episode)",
-    )
+    parser.add_argument("--timeout", type=parse_seconds, metavar="S", help="at most so long (150, 60 more per episode)")
     link = parser.add_mutually_exclusive_group()
-    link.add_argument(
-        "--profile",
-        default="",
-        metavar="NAME",
-        help="link profile of every operator (docs/evidence/links.md), e.g. busy-wifi",
-    )
-    link.add_argument(
-        "--latency",
-        type=make_number_type(float, "a delay: give 0 to 10000 milliseconds, for example 40", 0.0, 10_000.0),
-        metavar="MS",
-        help="delay of every operator's link, each way",
-    )
+    link.add_argument("--profile", default="", metavar="NAME", help="link of every operator (docs/evidence/links.md)")
+    delay = make_number_type(float, "a delay: give 0 to 10000 milliseconds, for example 40", 0.0, 10_000.0)
+    link.add_argument("--latency", type=delay, metavar="MS", help="delay of every operator's link, each way")
     add_session_options(parser)
-    add_json_option(parser)
     parser.set_defaults(control_port=0, state_port=0)
 
 
@@ -113,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
     if profile:
         load_profile(profile)  # fails before anything is started
     play = _make_demo(arguments)
-    timeout_s = arguments.timeout or 150.0 + 60.0 * (arguments.episodes - 1)
+    timeout_s = arguments.timeout or 90.0 + 60.0 * (arguments.episodes or 1)
     config = make_session_config(arguments, arguments.demo)
     out = sys.stderr if arguments.json else sys.stdout
 
@@ -136,11 +111,9 @@ def _make_demo(arguments: argparse.Namespace) -> Demo:
     """Return the demo of the arguments: a packaged one, or the handover in a scene."""
     from iris_session.demo.demos import make_demo, make_planned_handover
 
-    given = [f"--{name}" for name in ("object", "from", "to") if getattr(arguments, _FIELDS.get(name, name))]
-    given += ["--episodes"] if arguments.episodes > 1 else []
     if arguments.scene is None:
-        if given:
-            raise CommandError(f"{', '.join(given)}: name the scene, such as `iris-session demo handover scene.xml`")
+        why = ": name the scene, such as `iris-session demo handover scene.xml`"
+        refuse_options(arguments, ("object", "from", "to", "episodes"), why)
         return make_demo(arguments.demo, arguments.operators, arguments.observers, arguments.seed)
     if arguments.demo != "handover":
         raise CommandError(f"demo {arguments.demo} has its own scene: `iris-session demo handover {arguments.scene}`")
@@ -149,9 +122,9 @@ def _make_demo(arguments: argparse.Namespace) -> Demo:
     return make_planned_handover(
         open_scene(arguments.scene),
         arguments.object,
-        arguments.giver,
-        arguments.receiver,
-        episodes=arguments.episodes,
+        getattr(arguments, "from"),
+        arguments.to,
+        episodes=arguments.episodes or 1,
         observers=arguments.observers,
         seed=arguments.seed,
     )

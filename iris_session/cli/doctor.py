@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import add_address_options, add_command, add_json_option, print_result
+from iris_session.cli.common import Commands, add_address_options, add_command, print_result
 from iris_session.protocol.names import Role
 
 if TYPE_CHECKING:
@@ -19,8 +19,7 @@ PROBLEM_STATES: Final = ("failed", "warning", "skipped")
 MARKS: Final = {"ok": "ok     ", "warning": "WARNING", "failed": "FAILED ", "skipped": "-      "}
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `doctor`."""
+def register(commands: Commands) -> None:
     parser = add_command(
         commands,
         "doctor",
@@ -36,16 +35,12 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         """,
     )
     add_address_options(parser, code="a join code to try; it is used up")
-    parser.add_argument(
-        "--role", choices=sorted(Role.ALL), default=Role.OBSERVER, help="role to try (default: %(default)s)"
-    )
+    parser.add_argument("--role", choices=sorted(Role.ALL), default=Role.OBSERVER, help="role to try (%(default)s)")
     parser.add_argument("--server", action="store_true", help="check this machine as a server")
     parser.add_argument("--identity", default="", metavar="DIR", help="folder of keys (default: as for every command)")
-    parser.add_argument(
-        "--record", type=Path, default=Path("sessions"), metavar="DIR", help="--server: folder of recordings"
-    )
+    text = "--server: folder of recordings"
+    parser.add_argument("--record", type=Path, default=Path("sessions"), metavar="DIR", help=text)
     parser.add_argument("--all", action="store_true", help="also print skipped checks")
-    add_json_option(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -71,8 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
             on_progress=show_progress,
         )
     lines = [*format_findings(result.findings, show_skipped=arguments.all), format_verdict(result.findings)]
-    print_result(arguments, result.as_dict(), lines)
-    return 0 if result.ok else 1
+    return print_result(arguments, result.as_dict(), lines, ok=result.ok)
 
 
 def format_findings(findings: Iterable[Finding], *, show_skipped: bool = False) -> Iterator[str]:

@@ -7,6 +7,7 @@ import os
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
     check_session_reachable,
@@ -15,12 +16,12 @@ from iris_session.cli.common import (
 )
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `emulate`."""
+def register(commands: Commands) -> None:
     parser = add_command(
         commands,
         "emulate",
         run,
+        has_json=False,
         help="join with emulated headsets",
         description="Emulated operators join a session: each has its own tracking frame, observes the sheet until it "
         "is aligned, acquires a robot and works. Ends when every operator with a task is done, or after --seconds.",
@@ -39,37 +40,24 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     parser.add_argument("--count", type=int, default=1, help="number of headsets with --behaviour")
     parser.add_argument("--seed", type=int, default=0, help="random seed of frames, noise and motion")
     parser.add_argument("--drift", type=float, metavar="MM", help="drift of the tracking frames, mm per minute (1)")
-    parser.add_argument(
-        "--bump-at", type=float, action="append", default=[], metavar="S",
-        help="after this many seconds the tracking frames jump by 50 mm, unnoticed by the headsets; repeatable",
-    )  # fmt: skip
-    parser.add_argument(
-        "--glance-every",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="observe the sheet again every S seconds while working",
-    )
+    text = "after this many seconds the tracking frames jump by 50 mm, unnoticed by the headsets; repeatable"
+    parser.add_argument("--bump-at", type=float, action="append", default=[], metavar="S", help=text)
+    text = "observe the sheet again every S seconds while working"
+    parser.add_argument("--glance-every", type=float, default=0.0, metavar="S", help=text)
     parser.add_argument("--headset", action="append", default=[], metavar="KEY=VALUE,...", help="one headset in detail")
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
-    parser.add_argument(
-        "--join-timeout",
-        type=float,
-        default=15.0,
-        metavar="S",
-        help="stop if no session admits us within this time (%(default)s)",
-    )
+    text = "stop if no session admits us within this time (%(default)s)"
+    parser.add_argument("--join-timeout", type=float, default=15.0, metavar="S", help=text)
     parser.add_argument("--curve-server", default="", metavar="FILE", help="the session's public CURVE key (*.key)")
     parser.add_argument("--curve-key", default="", metavar="FILE", help="CURVE secret key of the client (*.key_secret)")
-    parser.add_argument(
-        "--orders", action="store_true", help="read orders from standard input: bump, recentre, drift or steady NAME"
-    )
+    parser.add_argument("--orders", action="store_true", help="read lines: bump, recentre, drift or steady NAME")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
+    parser.set_defaults(specs="")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the emulated headsets in this process. Exit status 0 if none failed."""
-    from iris_session.emulator.__main__ import main
+    from iris_session.emulator.__main__ import run as run_headsets
 
     if arguments.headset and (arguments.drift is not None or arguments.bump_at or arguments.glance_every):
         raise CommandError(
@@ -81,20 +69,12 @@ def run(arguments: argparse.Namespace) -> int:
         common += ",bump_at_s=" + "/".join(map(str, arguments.bump_at))
     if arguments.drift is not None:
         common += f",model.drift_m_per_min={arguments.drift / 1000.0}"
-    headsets = arguments.headset or [
+    arguments.headset = arguments.headset or [
         f"name={arguments.behaviour}{i + 1}-{os.getpid()},behaviour={arguments.behaviour},robot={arguments.robot},"
         f"seed={arguments.seed + i}{common}"
         for i in range(arguments.count)
     ]
-    options = ["--address", arguments.address, "--session", arguments.session, "--code", arguments.code]
-    options += ["--join-timeout", str(arguments.join_timeout)]
-    options += ["--curve-server", arguments.curve_server, "--curve-key", arguments.curve_key]
-    for headset in headsets:
-        options += ["--headset", headset]
-    if arguments.seconds is not None:
-        options += ["--seconds", str(arguments.seconds)]
-    options += [flag for flag, given in (("--json", arguments.json), ("--orders", arguments.orders)) if given]
-    status = main(options, "iris-session")
+    status = run_headsets(arguments, "iris-session")
     if status == 1:
         try:  # only now, for a better message: the session may have started meanwhile
             check_session_reachable(arguments)

@@ -34,9 +34,6 @@ HOST: Final = "127.0.0.1"
 KEEP: Final = "keep"
 DROP: Final = "drop"
 DECISIONS: Final = (KEEP, DROP, SUCCESS, FAILURE)
-QUALITY: Final = 80
-_PAGE: Final = Path(__file__).with_name("episodes_page.html")
-_MAX_BODY: Final = 4096
 _POLICY: Final = (
     "default-src 'none'; img-src 'self' data:; connect-src 'self'; script-src 'nonce-{0}'; style-src 'nonce-{0}'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -71,7 +68,7 @@ class EpisodesPage:
 
     def make_app(self) -> web.Application:
         """Return the application of aiohttp."""
-        app = web.Application(middlewares=[self._check], client_max_size=_MAX_BODY)
+        app = web.Application(middlewares=[self._check], client_max_size=4096)
         app.router.add_get("/", self._get_page)
         app.router.add_get("/episodes", self._get_episodes)
         app.router.add_get(r"/strips/{recording:\d{1,6}}/{episode:\d{1,6}}/{camera:\d{1,3}}", self._get_strip)
@@ -98,7 +95,8 @@ class EpisodesPage:
 
     async def _get_page(self, request: web.Request) -> web.Response:
         nonce = secrets.token_urlsafe(12)
-        text = _PAGE.read_text(encoding="utf-8").replace("NONCE", nonce)
+        page = Path(__file__).with_name("episodes_page.html")
+        text = page.read_text(encoding="utf-8").replace("NONCE", nonce)
         headers = {"Content-Security-Policy": _POLICY.format(nonce)}
         return web.Response(text=text, content_type="text/html", headers=headers)
 
@@ -125,7 +123,7 @@ class EpisodesPage:
                 for i, camera, strip in draw_strips(
                     listed.path, [one.span_ns for one in listed.episodes], self._cameras
                 ):
-                    Image.fromarray(strip).save(self._folder / f"{index}-{i}-{camera}.jpg", quality=QUALITY)
+                    Image.fromarray(strip).save(self._folder / f"{index}-{i}-{camera}.jpg", quality=80)
             except (IrisError, OSError) as error:
                 self._drawn[index] = " ".join(str(error).split())
         return self._drawn[index]
@@ -147,11 +145,7 @@ class EpisodesPage:
 
 
 def write_decision(listed: ListedRecording, wanted: ButtonPress) -> None:
-    """Write what a button says. A verdict that is the recorded one is no decision.
-
-    Raises:
-        DatasetError: There is no such episode, or the curation cannot be read or written.
-    """
+    """Write what a button says. A verdict that is the recorded one is no decision. Raises `DatasetError`."""
     number = wanted.number
     if wanted.decision in (KEEP, DROP):
         edits = Edits(drop=(number,)) if wanted.decision == DROP else Edits(keep=(number,))

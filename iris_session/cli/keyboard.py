@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 #: Time until a terminal is looked at again while another program has it [s].
 BACKGROUND_S: Final = 0.5
 ESTOP_KEY: Final = " "
-_LOCAL_MODES: Final = 3  # in what `tcgetattr` returns
 
 
 class KeyBinding(NamedTuple):
@@ -104,7 +103,8 @@ def _follow_keys(fd: int, wake: int, keys: Mapping[str, KeyBinding]) -> None:
                 return
             continue
         with suppress(termios.error):
-            if termios.tcgetattr(fd)[_LOCAL_MODES] & termios.ICANON:  # a shell has had the terminal meanwhile
+            local_modes = termios.tcgetattr(fd)[3]
+            if local_modes & termios.ICANON:  # a shell has had the terminal meanwhile
                 tty.setcbreak(fd)
         if fd not in found:
             continue

@@ -7,47 +7,29 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from iris_session.cli.common import CommandError, add_command, add_json_option, pick_attributes, print_result
+from iris_session.cli.common import CommandError, Commands, add_actions, add_command, pick_attributes, print_result
 from iris_session.cli.pair import add_role_option, parse_roles
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import CURVE
 
 if TYPE_CHECKING:
-    from iris_session.security import KeyHome, KeyPair
-    from iris_session.web.certificate import Certificate
+    from iris_session.security import KeyPair
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `keys`."""
-    parser = add_command(
+def register(commands: Commands) -> None:
+    actions = add_actions(
         commands,
         "keys",
-        None,
         help="list, allow and revoke the keys that may join",
         description="Manage the keys that may join encrypted sessions of this user, and show the user's own keys. "
         "Running sessions apply changes within half a second: a revoked key is disconnected at once.",
-        examples="""
-            iris-session keys list
-            iris-session keys revoke quest-3
-            iris-session keys allow ann ann.key --role operator    a key received without a join code
-            iris-session keys allow me                             this user, on the server's machine
-            iris-session keys show                                 fingerprints of this user
-        """,
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    one = add_command(
-        actions,
-        "list",
-        run_list,
-        help="keys that may join",
-        description="List the keys that may join.",
-        examples="iris-session keys list --json",
-    )
-    add_json_option(one)
+    add_command(actions, "list", run_list, help="list the keys that may join", examples="iris-session keys list --json")
     one = add_command(
         actions,
         "allow",
         run_allow,
+        has_json=False,
         help="allow a key",
         description="Add a key to the list, or change its roles. Without a key: this user's own, to direct too.",
         examples="""
@@ -56,35 +38,31 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         """,
     )
     one.add_argument("name", help="name of the key in the list")
-    one.add_argument(
-        "key",
-        nargs="?",
-        default="",
-        help="ZeroMQ certificate (*.key), or the public key as 40 characters of Z85 (default: this user's own)",
-    )
+    text = "ZeroMQ certificate (*.key), or the public key as 40 characters of Z85 (default: this user's own)"
+    one.add_argument("key", nargs="?", default="", help=text)
     add_role_option(one)
     one = add_command(
         actions,
         "revoke",
         run_revoke,
+        has_json=False,
         help="revoke a key",
         description="Remove a key from the list; participants who use it are disconnected.",
         examples="iris-session keys revoke quest-3",
     )
     one.add_argument("name", help="name or fingerprint in the list")
-    one = add_command(
+    add_command(
         actions,
         "show",
         run_show,
-        help="own fingerprints",
-        description="Show the folder of keys, and the user's own keys.",
+        help="show the folder of keys, and the user's own keys",
         examples="iris-session keys show",
     )
-    add_json_option(one)
     one = add_command(
         actions,
         "forget",
         run_forget,
+        has_json=False,
         help="forget the key of a server",
         description="Remove the stored key of a session's address, so that a new key can be trusted.",
         examples="iris-session keys forget 192.168.1.20:7721",
@@ -105,8 +83,9 @@ def run_list(arguments: argparse.Namespace) -> int:
         f"{', '.join(one.roles) or 'any role'}  added {one.added or 'manually'}  last seen {one.last_seen or 'never'}"
         for mark, one in keys.items()
     ]
-    print_result(arguments, {"keys": rows}, lines or ["no keys are allowed yet: `iris-session pair` adds a new device"])
-    return 0
+    return print_result(
+        arguments, {"keys": rows}, lines or ["no keys are allowed yet: `iris-session pair` adds a new device"]
+    )
 
 
 def run_allow(arguments: argparse.Namespace) -> int:
@@ -141,9 +120,10 @@ def run_revoke(arguments: argparse.Namespace) -> int:
 def run_show(arguments: argparse.Namespace) -> int:
     """Print the user's own keys, without secrets. Creates none."""
     from iris_session.security import KeyHome
+    from iris_session.web.certificate import find_certificate
 
     home = KeyHome()
-    server, own, page = home.find_server_key(), home.find_identity(), _find_page_certificate(home)
+    server, own, page = home.find_server_key(), home.find_identity(), find_certificate(home)
     certificate = None if page is None else {"fingerprint": page.fingerprint, "key": page.key}
     keys = {"server": _key_to_dict(server), "identity": _key_to_dict(own), "certificate": certificate}
     text = "no certificate yet, created when you serve an encrypted session"
@@ -155,19 +135,7 @@ def run_show(arguments: argparse.Namespace) -> int:
         f"you as a client   {_format_key(own, 'created when you join an encrypted session')}",
         f"page for browsers {text}",
     ]
-    print_result(arguments, {"home": str(home.path), **keys}, lines)
-    return 0
-
-
-def _find_page_certificate(home: KeyHome) -> Certificate | None:
-    """Return the certificate of the page, `None` where there is none, or nothing to read it with."""
-    from iris_session.system.extras import MissingExtraError
-    from iris_session.web.certificate import find_certificate
-
-    try:
-        return find_certificate(home)
-    except MissingExtraError:
-        return None
+    return print_result(arguments, {"home": str(home.path), **keys}, lines)
 
 
 def _key_to_dict(pair: KeyPair | None) -> dict[str, str] | None:

@@ -43,8 +43,8 @@ def format_event(event: Event, text: str) -> str:
 class TerminalView:
     """Sender of refreshes to the display process.
 
-    Call `update()` often from the session's loop; it sends at most every `REFRESH_S`. `skipped` counts the refreshes
-    for which the display was too slow.
+    Call `update()` often from the session's loop; it sends at most every `REFRESH_S`, and skips refreshes for which the
+    display is too slow.
     """
 
     def __init__(self, session: SessionBase, out: TextIO, title: str, footer: str = "") -> None:
@@ -57,7 +57,6 @@ class TerminalView:
         self._narration = EventNarration()
         self._pipe = -1
         self._pending = b""  # rest of a refresh that did not fit into the pipe: it is sent before the next
-        self.skipped = 0
 
     @contextmanager
     def open(self) -> Iterator[Callable[[], None]]:
@@ -84,7 +83,6 @@ class TerminalView:
             return
         self._next_s = now + REFRESH_S
         if not self._send():
-            self.skipped += 1
             return
         fresh = [e for e in self._session.recent_events() if e.event_seq > self._seen]
         narrated = [(event, self._narration.add(event).line) for event in fresh]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
 import signal
 import sys
 from importlib.metadata import version
-from typing import NoReturn
 
 from iris_session.cli import (
     INTERRUPTED,
@@ -30,37 +28,10 @@ from iris_session.cli import (
     view,
     web,
 )
-from iris_session.cli.common import CommandError, describe_error, join_negative_poses, print_error
+from iris_session.cli.common import CommandError, CommandParser, describe_error, print_error
 from iris_session.protocol.errors import IrisError
 from iris_session.system.extras import describe_import_error
 from iris_session.system.log import LEVEL_VARIABLE, configure_logging
-
-_EPILOG = """examples:
-  iris-session demo handover                 two emulated operators hand over a hammer
-  iris-session serve scene.xml               share a MuJoCo scene on this machine
-  iris-session pair                          a join code and a QR code for one new device
-  iris-session pair --web                    a link and a QR code for one browser
-  iris-session web 192.168.0.10              a page here for a session on another machine
-  iris-session keys list                     the keys that may join
-  iris-session sessions                      the sessions on this network
-  iris-session robots scene.xml              the robots found in a model, as TOML to edit
-  iris-session scene inspect scene.xml       what clients receive of a scene, and what is heavy
-  iris-session anchors print --size 150mm    a sheet for headsets and cameras, as PDF
-  iris-session cloud example                 a file for depth cameras; inspect it, or run it in a session
-  iris-session emulate --behaviour wander    one emulated headset joins the session on this machine
-  iris-session policy --repo PATH --robot left    a trained policy of LeRobot drives a robot, beside people
-  iris-session status --watch                participants, robots, ages, late ticks, recorder of a session
-  iris-session estop                         stop every robot of the session; clear-estop, pause, assign, ... as well
-  iris-session doctor 192.168.1.20           what is wrong, why, and what to do
-  iris-session view                          the newest recording in Rerun's viewer
-  iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
-  iris-session recording inspect sessions    what recordings hold: who, what, how long, damage
-  iris-session export sessions --to lerobot --out set    a data set for training, of all successful episodes
-  iris-session recording export session.rrd --to csv -o tables
-  iris-session recording render session.rrd -o session.mp4
-  iris-session bench state --check           measure the state stream and compare it with its bars
-"""
-
 
 #: In the order of `--help`.
 _MODULES = (
@@ -69,24 +40,11 @@ _MODULES = (
 )  # fmt: skip
 
 
-class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, as all others; `--help` has the usage."""
-
-    def error(self, message: str) -> NoReturn:
-        for action in self._actions:
-            name = action.metavar or action.dest
-            if action.choices and not action.option_strings and message.endswith(f"arguments are required: {name}"):
-                message += f", one of {', '.join(action.choices)}"
-        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
-
-
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> CommandParser:
     """Return the parser of the whole command line."""
-    parser = _Parser(
+    parser = CommandParser(
         prog="iris-session",
         description="Share one robot scene between several people in XR headsets.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"iris-session {version('iris-session')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -108,7 +66,7 @@ def _run_command(argv: list[str] | None) -> int:
     session_log = logging.getLogger("iris_session.session")
     try:
         configure_logging()
-        arguments = build_parser().parse_args(join_negative_poses(sys.argv[1:] if argv is None else argv))
+        arguments = build_parser().parse_args(argv)
         os.environ.setdefault("MUJOCO_GL", "disable")  # MuJoCo need not load OpenGL: what draws loads it by itself
         if LEVEL_VARIABLE not in os.environ:
             # `serve` and `demo` show restarts, gaps and overruns as events. The log would repeat them, from the thread

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 from iris_session.cli.common import (
     ABOVE_0,
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     make_number_type,
+    parse_port,
     print_error,
     print_json,
     print_result,
+    writing,
 )
 from iris_session.protocol.names import Role
 from iris_session.security.allow_list import DEFAULT_ROLES
@@ -41,8 +43,7 @@ FAILURE_TEXTS: Final = {
 }
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `pair`."""
+def register(commands: Commands) -> None:
     parser = add_command(
         commands,
         "pair",
@@ -66,46 +67,25 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     minutes = make_number_type(float, wanted, ABOVE_0, MAX_MINUTES)
     parser.add_argument("--minutes", type=minutes, default=10.0, metavar="M", help="validity in minutes (10)")
     parser.add_argument("--name", default="", help="name of the device in the list (default: as the device sends it)")
-    parser.add_argument(
-        "--session", default="", metavar="NAME", help="name of the session, if several run on this machine"
-    )
-    parser.add_argument(
-        "--address", default="", metavar="HOST[:PORT]", help="address at which others reach the session"
-    )
-    parser.add_argument(
-        "--curve-key", default="", metavar="FILE", help="secret key of the session (default: the user's)"
-    )
+    parser.add_argument("--session", default="", metavar="NAME", help="which session, if several run on this machine")
+    parser.add_argument("--address", default="", metavar="HOST[:PORT]", help="where others reach the session")
+    parser.add_argument("--curve-key", default="", metavar="FILE", help="secret key of the session (default: yours)")
     parser.add_argument("--web", action="store_true", help="show a link to the page for browsers as the QR code")
-    parser.add_argument(
-        "--unity",
-        type=Path,
-        metavar="FILE",
-        help="write addresses, key of the certificate and code as JSON, which the headset apps read at start; secret "
-        "until the code is used",
+    text = (
+        "write addresses, key of the certificate and code as JSON, which the headset apps read at start; secret "
+        "until the code is used"
     )
-    parser.add_argument(
-        "--web-port",
-        type=int,
-        metavar="PORT",
-        help="port of the page (default: as the session has said, or by --address)",
-    )
+    parser.add_argument("--unity", type=Path, metavar="FILE", help=text)
+    parser.add_argument("--web-port", type=parse_port, metavar="PORT", help="port of the page (default: it is found)")
     parser.add_argument("--png", type=Path, metavar="FILE", help="also write the QR code as an image")
-    parser.add_argument(
-        "--web-cert", default="", metavar="FILE", help="certificate of the page (default: this user's own)"
-    )
+    parser.add_argument("--web-cert", default="", metavar="FILE", help="certificate of the page (default: yours)")
     parser.add_argument("--no-wait", action="store_true", help="do not wait until the code is used")
-    add_json_option(parser)
 
 
 def add_role_option(parser: argparse.ArgumentParser) -> None:
     """Add `--role`, for `pair` and `keys allow`."""
-    parser.add_argument(
-        "--role",
-        action="append",
-        choices=[*sorted(Role.ALL), ANY_ROLE],
-        metavar="ROLE",
-        help=f"role of the key, repeatable (default: {', '.join(DEFAULT_ROLES)}); {ANY_ROLE}: every role",
-    )
+    text = f"role of the key, repeatable (default: {', '.join(DEFAULT_ROLES)}); {ANY_ROLE}: every role"
+    parser.add_argument("--role", action="append", choices=[*sorted(Role.ALL), ANY_ROLE], metavar="ROLE", help=text)
 
 
 def parse_roles(names: list[str] | None) -> tuple[str, ...]:
@@ -120,8 +100,6 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.security import KeyHome, load_secret
     from iris_session.web.config import format_page_address
 
-    if arguments.web_port is not None and not 0 < arguments.web_port < 65536:
-        raise CommandError(f"--web-port {arguments.web_port} is not a port: give 1 to 65535")
     home = KeyHome()
     key = load_secret(arguments.curve_key) if arguments.curve_key else home.load_server_key()
     session, places, web = _find_addresses(arguments, home, key)
@@ -180,10 +158,8 @@ def _write_pairing_file(
         "code": invitation["code"],
         "expires": invitation["expires"],
     }
-    try:
+    with writing(path):
         write_atomic(path, json.dumps(pairing, indent=2).encode() + b"\n", permissions=0o600)
-    except OSError as error:
-        raise CommandError(f"{path} cannot be written: {error.strerror}") from error
     if all(is_loopback(host) for host in hosts):
         print_error(
             f"{hosts[0]} is this machine alone: a headset reaches it only by cable, after `adb reverse tcp:{web} "
@@ -193,65 +169,47 @@ def _write_pairing_file(
 
 def _find_certificate(arguments: argparse.Namespace, home: KeyHome, hosts: list[str]) -> Certificate | None:
     """Return the certificate of the page: the code works there too. Made where `--web` or `--unity` needs it."""
-    from iris_session.system.extras import MissingExtraError
     from iris_session.web.certificate import find_certificate, load_certificate, load_or_make_certificate
 
     if arguments.web_cert:
         return load_certificate(arguments.web_cert)
-    try:
-        return load_or_make_certificate(home, hosts) if _needs_web(arguments) else find_certificate(home)
-    except MissingExtraError:
-        if _needs_web(arguments):
-            raise
-        return None  # no page, no certificate
+    return load_or_make_certificate(home, hosts) if _needs_web(arguments) else find_certificate(home)
 
 
 def _find_addresses(
     arguments: argparse.Namespace, home: KeyHome, key: KeyPair
 ) -> tuple[str, list[tuple[str, int]], int]:
-    """Return the name of the session, hosts and ports at which others reach it, best first, and the page's port.
-
-    The port is 0 for a session without a page.
-    """
+    """Return the session's name, hosts and ports at which others reach it, best first, and the page's port or 0."""
     from iris_session.client.discovery import Address
+    from iris_session.web.config import WEB_FROM_CONTROL
 
     here = [note for note in home.sessions.read() if note.server == key.fingerprint]
     found = [note for note in here if arguments.session in ("", note.name)]
     if arguments.address:
         address = Address.parse(arguments.address)
-        same = [note for note in found if note.control == address.port]
-        web = _find_web_port(arguments, same[0]) if same else _guess_web_port(arguments, address.port)
-        return arguments.session, [(address.host, address.port)], web
-    if len(found) != 1:
+        name, places = arguments.session, [(address.host, address.port)]
+        found = [note for note in found if note.control == address.port]
+    elif len(found) == 1:
+        name, places = found[0].name, [(host, found[0].control) for host in found[0].hosts]
+    else:
         raise CommandError(_format_session_choice(arguments.session, here, found))
-    return found[0].name, [(host, found[0].control) for host in found[0].hosts], _find_web_port(arguments, found[0])
-
-
-def _find_web_port(arguments: argparse.Namespace, note: RegisteredSession) -> int:
-    """Return the port of the page of a session on this machine, 0 for none."""
-    port = int(arguments.web_port or note.web)
-    if _needs_web(arguments) and not port:
+    note = found[0] if found else None
+    control = places[0][1]
+    web = int(arguments.web_port or (control + WEB_FROM_CONTROL if note is None else note.web))
+    if not _needs_web(arguments):
+        pass
+    elif note is None and arguments.web_port is None:
+        print_error(
+            f"no session with control port {control} runs here, so the page is assumed at port {web}: give --web-port "
+            "if it has another one"
+        )
+    elif note is not None and not web:
         raise CommandError(
             f"session {note.name!r} serves no page: pip install 'iris-session[web]' there, or leave out --no-web"
         )
-    if _needs_web(arguments) and note.web and port != note.web:
-        print_error(f"session {note.name!r} serves its page at port {note.web}, not {port}")
-    return port
-
-
-def _guess_web_port(arguments: argparse.Namespace, control_port: int) -> int:
-    """Return the port of the page of a session that does not run here: the usual one, unless it was given."""
-    from iris_session.web.config import WEB_FROM_CONTROL
-
-    if arguments.web_port is not None:
-        return int(arguments.web_port)
-    port = control_port + WEB_FROM_CONTROL
-    if _needs_web(arguments):
-        print_error(
-            f"no session with control port {control_port} runs here, so the page is assumed at port {port}: give "
-            "--web-port if it has another one"
-        )
-    return port
+    elif note is not None and note.web not in (0, web):
+        print_error(f"session {note.name!r} serves its page at port {note.web}, not {web}")
+    return name, places, web
 
 
 def _format_session_choice(name: str, here: list[RegisteredSession], found: list[RegisteredSession]) -> str:
@@ -271,10 +229,8 @@ def _print_invitation(arguments: argparse.Namespace, invitation: dict[str, Any])
 
     qr = segno.make(invitation["page"] if arguments.web else invitation["uri"], micro=False, error="m")
     if arguments.png is not None:
-        try:
+        with writing(arguments.png):
             qr.save(str(arguments.png), kind="png", scale=10, border=4)
-        except OSError as error:
-            raise CommandError(f"{arguments.png} cannot be written: {error.strerror}") from error
     if arguments.json:
         print_json(invitation)
         return
@@ -312,12 +268,10 @@ def _wait_until_used(home: KeyHome, made: JoinCode, arguments: argparse.Namespac
     entry = None if now is None else now.paired
     if entry is not None and entry.fingerprint in home.clients.read():
         result = {"paired": entry.name, "fingerprint": entry.fingerprint, "roles": entry.roles}
-        print_result(arguments, result, [f"paired: {entry.name} ({entry.fingerprint})"])
-        return 0
+        return print_result(arguments, result, [f"paired: {entry.name} ({entry.fingerprint})"])
     reason = "expired"
     if now is not None and now.attempts_left == 0:
         reason = "void"
     elif now is not None and (entry is not None or (not now.secret and time.time() < now.expires)):
         reason = "not_listed"
-    print_result(arguments, {"paired": None, "reason": reason}, [FAILURE_TEXTS[reason]])
-    return 1
+    return print_result(arguments, {"paired": None, "reason": reason}, [FAILURE_TEXTS[reason]], ok=False)

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
-    add_json_option,
     check_session_reachable,
     ending_as_interrupts,
     make_client,
+    make_number_type,
     parse_seconds,
     print_json,
 )
@@ -40,7 +41,6 @@ HZ: Final = 30.0
 PATIENCE_S: Final = 0.1
 #: After so long without a decision it commands nothing: robots hold, as for everything that has stopped [s].
 STUCK_S: Final = 1.0
-REPORT_S: Final = 1.0
 NO_LEROBOT: Final = (
     "LeRobot is not installed here: make an environment with both, pip install lerobot 'iris-session[env,files]'"
 )
@@ -49,8 +49,7 @@ DRIVEN, INTERVENTION, WAITING = "driven", "intervention", "waiting"
 Observation = Mapping[str, Any]
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `policy`."""
+def register(commands: Commands) -> None:
     parser = add_command(
         commands,
         "policy",
@@ -65,32 +64,22 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     parser.add_argument("--repo", required=True, metavar="PATH", help="folder of a checkpoint, or its name on the hub")
     parser.add_argument("--robot", action="append", required=True, metavar="NAME", help="a robot, repeatable")
-    parser.add_argument(
-        "--camera", action="append", default=[], metavar="NAME",
-        help="a camera of the session, repeatable (default: those that the policy needs)",
-    )  # fmt: skip
-    parser.add_argument("--hz", type=float, default=HZ, help="steps a second, as in the data set (%(default)g)")
+    text = "a camera of the session, repeatable (default: those that the policy needs)"
+    parser.add_argument("--camera", action="append", default=[], metavar="NAME", help=text)
+    rate = make_number_type(float, "a rate: give 1 to 240 steps a second, for example 30", 1.0, 240.0)
+    parser.add_argument("--hz", type=rate, default=HZ, help="steps a second, as in the data set (%(default)g)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:1, ... (%(default)s)")
     parser.add_argument("--task", default="", help="task in words, for policies that read it")
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
     add_address_options(parser, option=True)
-    add_json_option(parser)
 
 
 class LeRobotPolicy:
-    """A checkpoint of LeRobot with its normalisation.
-
-    Args:
-        repo: Folder of the checkpoint, or its name on the hub.
-        device: Of torch.
-        task: Text for policies that read one.
+    """A checkpoint of LeRobot, a folder or a name on the hub, with its normalisation. Raises `CommandError`.
 
     Attributes:
         inputs: Shapes of the observations that it needs, by their name in the data set; pictures (3, h, w).
         n_actions: Numbers of an action.
-
-    Raises:
-        CommandError: LeRobot is not installed, or the checkpoint cannot be loaded.
     """
 
     def __init__(self, repo: str, device: str = "cpu", task: str = "") -> None:
@@ -180,8 +169,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Drive until Ctrl-C or `--seconds`. Exit status 0, or 1 when the session has ended."""
     from iris_session.client.robot_env import RobotEnv
 
-    if not 1.0 <= arguments.hz <= 240.0:
-        raise CommandError(f"--hz {arguments.hz:g}: 1 to 240 are possible")
     check_session_reachable(arguments)
     policy = LeRobotPolicy(arguments.repo, arguments.device, arguments.task)
     images = "observation.images."
@@ -281,7 +268,7 @@ class RunLog:
             self._interventions[robot] += state == INTERVENTION != self._states.get(robot)
             states[robot] = state
         self._states = states
-        if now_s - self._reported_s >= REPORT_S:
+        if now_s - self._reported_s >= 1.0:
             self._report(info, now_s)
         return states
 

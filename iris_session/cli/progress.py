@@ -12,7 +12,6 @@ from iris_session.cli.common import to_printable
 
 #: A file that takes longer shows how far it was read [s].
 PROGRESS_AFTER_S: Final = 1.0
-PROGRESS_PERIOD_S: Final = 0.2
 #: In a file or pipe, time between two lines [s].
 LINE_PERIOD_S: Final = 10.0
 
@@ -39,7 +38,7 @@ class ProgressLine:
                 self._due_s = now_s + LINE_PERIOD_S
                 print(f"{self._path}: {text}", file=sys.stderr, flush=True)
         elif at_once or now_s >= self._due_s:
-            self._due_s = now_s + PROGRESS_PERIOD_S
+            self._due_s = now_s + 0.2
             self._shown = True
             print(f"\r\x1b[K{self._path}: {text}", end="", file=sys.stderr, flush=True)
 

@@ -4,18 +4,16 @@ and `repair`. The other actions have modules of their own. `view` and `verify` a
 from __future__ import annotations
 
 import argparse
-import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from iris_session.cli import recording_episodes, recording_export, recording_render, view
 from iris_session.cli.common import (
-    MOST_LINES,
-    CommandError,
+    Commands,
+    add_actions,
     add_command,
-    add_json_option,
     ending_as_interrupts,
     list_first,
     print_error,
@@ -36,35 +34,21 @@ if TYPE_CHECKING:
     )
     from iris_session.rrd.assets import AssetsSummary
 
-SUFFIX: Final = ".rrd"
 _CLASSES: Final = {
     "closed": "closed: `verify` re-simulates authority, control and physics",
     "open": "open: `verify` re-simulates authority and control, physics is taken from the file",
 }
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the commands `verify` and `recording`."""
+def register(commands: Commands) -> None:
     _register_verify(commands)
-    parser = add_command(
+    actions = add_actions(
         commands,
         "recording",
-        None,
         help="inspect, view, verify, export, render or repair recordings",
         description="Show what a recording holds, view and verify it, export it as tables, make a film or a picture of "
         "it, or repair it. `iris-session view` and `iris-session verify` are short for the actions of that name.",
-        examples="""
-            iris-session recording inspect sessions/20261121T093000.000000Z-handover/session.rrd
-            iris-session recording inspect sessions
-            iris-session recording episodes sessions --page
-            iris-session recording verify sessions
-            iris-session recording view
-            iris-session recording export session.rrd --to csv -o tables
-            iris-session recording render session.rrd -o session.mp4
-            iris-session recording repair session.rrd -o repaired.rrd
-        """,
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     inspect = add_command(
         actions,
         "inspect",
@@ -80,7 +64,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         """,
     )
     inspect.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it")
-    add_json_option(inspect)
     recording_episodes.register(actions)
     view.register(actions)
     _register_verify(actions)
@@ -102,31 +85,19 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     repair.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
     repair.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the file to write")
     repair.add_argument("--force", action="store_true", help="replace FILE if it exists")
-    add_json_option(repair)
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
-    """Print the summary of a recording, or a line for each of a folder."""
-    from iris_session.system.extras import require_package
-
-    path: Path = arguments.path
-    if not os.path.exists(path):
-        raise CommandError(f"{path} does not exist: give a recording (session{SUFFIX}), or a folder with recordings")
-    require_package("rerun", "reading recordings")
-    with ending_as_interrupts():
-        if path.is_dir():
-            return _inspect_folder(path, as_json=arguments.json)
-        summary = _summarise_file(path)
-    print_result(arguments, summary, format_summary(summary))
-    return 0 if summary.ok else 1
-
-
-def _inspect_folder(folder: Path, *, as_json: bool) -> int:
-    """Print a line for every recording below a folder. One that cannot be read does not hide the others."""
+    """Print the summary of a recording, or a line for each of a folder. One that is unreadable hides no other."""
     import msgspec
 
-    from iris_session.recording import RecordingError
-    from iris_session.recording.folders import find_recordings
+    from iris_session.dataset.episodes import list_files
+    from iris_session.recording import Recording, RecordingError
+    from iris_session.recording.summary import summarise
+
+    def summarise_file(path: Path) -> RecordingSummary:
+        with ReadingProgress(path) as progress, Recording.open(path, warn=False) as recording:
+            return summarise(recording, progress.show_steps)
 
     rows: list[dict[str, object]] = []
 
@@ -134,33 +105,24 @@ def _inspect_folder(folder: Path, *, as_json: bool) -> int:
         rows.append({"path": path, "ok": False, "error": why})
         print_error(why)
 
-    files = find_recordings(folder, lambda error: refuse(str(error.filename), str(error)))
-    if not files and not rows:
-        raise CommandError(
-            f"there is no recording below the folder {folder}: give a {SUFFIX} file that `serve` or `demo` wrote, or a "
-            "folder with such files"
-        )
-    for file in files:
-        try:
-            summary = _summarise_file(file)
-        except RecordingError as error:
-            refuse(str(file), str(error))
-            continue
-        rows.append(msgspec.to_builtins(summary))
-        if not as_json:
-            print(to_printable(format_line(summary)), flush=True)
+    files = list_files([arguments.path], lambda error: refuse(str(error.filename), str(error)))
+    with ending_as_interrupts():
+        if not arguments.path.is_dir():
+            summary = summarise_file(arguments.path)
+            return print_result(arguments, summary, format_summary(summary), ok=summary.ok)
+        for file in files:
+            try:
+                summary = summarise_file(file)
+            except RecordingError as error:
+                refuse(str(file), str(error))
+                continue
+            rows.append(msgspec.to_builtins(summary))
+            if not arguments.json:
+                print(to_printable(format_line(summary)), flush=True)
     ok = all(row["ok"] for row in rows)
-    if as_json:
+    if arguments.json:
         print_json({"ok": ok, "recordings": rows})
     return 0 if ok else 1
-
-
-def _summarise_file(path: Path) -> RecordingSummary:
-    from iris_session.recording import Recording
-    from iris_session.recording.summary import summarise
-
-    with ReadingProgress(path) as progress, Recording.open(path, warn=False) as recording:
-        return summarise(recording, progress.show_steps)
 
 
 def format_line(summary: RecordingSummary) -> str:
@@ -200,27 +162,29 @@ def format_summary(summary: RecordingSummary) -> Iterator[str]:
     yield f"  objects    {_join(summary.objects)}"
     if summary.deformables:
         yield f"  deforming  {_join(summary.deformables)}"
-    yield from _format_list("people", [_format_person(person) for person in summary.people])
-    yield from _format_list("alignment", [*_format_alignments(summary.people)])
-    yield from _format_list("episodes", [_format_episode(one) for one in summary.episodes])
     handovers = [
         f"{one.object}: {_format_hand(one.giver, one.giver_name)} to {_format_hand(one.receiver, one.receiver_name)} "
         f"at {one.at_s:.2f} s, both held it for {one.both_held_s:.2f} s"
         for one in summary.handovers
     ]
-    yield from _format_list("handovers", handovers)
-    yield from _format_list("e-stops", [_format_stop(stop) for stop in summary.stops])
-    if summary.pauses:
-        yield from _format_list("pauses", [_format_stop(pause) for pause in summary.pauses])
-    if summary.scene_changes:
-        yield from _format_list("scene", [f"{one.cause} at {one.at_s:.2f} s" for one in summary.scene_changes])
-    if summary.streams:
-        yield from _format_list("streams", [_format_stream(stream) for stream in summary.streams])
-    yield from _format_list("assets", _format_assets(summary.assets))
-    yield from _format_list("drops", [*_format_drops(summary)])
-    yield from _format_list("damage", summary.damage)
-    if summary.notes:
-        yield from _format_list("notes", summary.notes)
+    lists: dict[str, Sequence[str]] = {
+        "people": [*map(_format_person, summary.people)],
+        "alignment": [*_format_alignments(summary.people)],
+        "episodes": [*map(_format_episode, summary.episodes)],
+        "handovers": handovers,
+        "e-stops": [*map(_format_stop, summary.stops)],
+        "pauses": [*map(_format_stop, summary.pauses)],
+        "scene": [f"{one.cause} at {one.at_s:.2f} s" for one in summary.scene_changes],
+        "streams": [*map(_format_stream, summary.streams)],
+        "assets": _format_assets(summary.assets),
+        "drops": [*_format_drops(summary)],
+        "damage": summary.damage,
+        "notes": summary.notes,
+    }
+    for title, lines in lists.items():
+        if lines or title not in ("pauses", "scene", "streams", "notes"):
+            for i, line in enumerate(list_first(lines or ["none"])):
+                yield f"  {title if i == 0 else '':9s}  {line}"
 
 
 def _format_episode(one: EpisodeSummary) -> str:
@@ -230,11 +194,6 @@ def _format_episode(one: EpisodeSummary) -> str:
     parts += [f"task {one.task}"] if one.task else []
     parts += [f"with {', '.join(one.robots)}"] if one.robots else []
     return ", ".join(parts)
-
-
-def _format_list(title: str, lines: Sequence[str]) -> Iterator[str]:
-    for i, line in enumerate(list_first(lines or ["none"])):
-        yield f"  {title if i == 0 else '':9s}  {line}"
 
 
 def _format_person(person: PersonSummary) -> str:
@@ -328,8 +287,7 @@ def _count(n: int, noun: str) -> str:
 
 
 def _join(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:MOST_LINES]) or "none"
-    return f"{shown} and {len(names) - MOST_LINES} more" if len(names) > MOST_LINES else shown
+    return ", ".join(list_first(names)) or "none"
 
 
 # --- repair -----------------------------------------------------------------------------------------------------------
@@ -340,12 +298,9 @@ def run_repair(arguments: argparse.Namespace) -> int:
     from iris_session.recording.repair import repair
 
     path: Path = arguments.path
-    if not path.exists():
-        raise CommandError(f"{path} does not exist: give a recording (session.rrd), or its folder")
     with ending_as_interrupts(), ReadingProgress(path) as progress:
         report = repair(path, arguments.out, overwrite=arguments.force, progress=progress.show_bytes)
-    print_result(arguments, report, format_repair(report))
-    return 0 if report.ok else 1
+    return print_result(arguments, report, format_repair(report), ok=report.ok)
 
 
 def format_repair(report: RepairReport) -> Iterator[str]:
@@ -370,7 +325,7 @@ def format_repair(report: RepairReport) -> Iterator[str]:
 # --- verify -----------------------------------------------------------------------------------------------------------
 
 
-def _register_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_verify(commands: Commands) -> None:
     parser = add_command(
         commands,
         "verify",
@@ -382,23 +337,18 @@ def _register_verify(commands: argparse._SubParsersAction[argparse.ArgumentParse
             iris-session verify sessions             every recording in a folder and below it
         """,
     )
-    parser.add_argument(
-        "files", nargs="+", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings below it"
-    )
-    add_json_option(parser)
+    parser.add_argument("files", nargs="+", type=Path, metavar="RECORDING", help="a .rrd, or a folder with recordings")
 
 
 def run_verify(arguments: argparse.Namespace) -> int:
     """Verify each file; the first problem of each is named with its step and entry."""
+    from iris_session.dataset.episodes import list_files
     from iris_session.recording import Problem, RecordingError, VerifyReport
-    from iris_session.system.extras import require_package
-
-    require_package("rerun", "verifying recordings")
     from iris_session.session.verification import verify_recording
 
     reports: list[VerifyReport] = []
 
-    def refuse(path: str, why: str) -> None:  # must not hide the others
+    def refuse(path: str, why: str) -> None:
         reports.append(VerifyReport(path, problems=[Problem(-1, "unreadable", "file", why)]))
         print_error(why)
 
@@ -406,7 +356,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
         try:
             with ending_as_interrupts(), ReadingProgress(path) as progress:
                 report = verify_recording(path, progress.show_steps)
-        except RecordingError as error:
+        except RecordingError as error:  # it hides no other
             refuse(str(path), str(error))
             continue
         if not arguments.json:
@@ -417,22 +367,3 @@ def run_verify(arguments: argparse.Namespace) -> int:
         print_json({"ok": ok, "files": [report.as_dict() for report in reports]})
     unreadable = all(p.kind == "unreadable" and p.step < 0 for report in reports for p in report.problems)
     return 0 if ok else 2 if unreadable else 1
-
-
-def list_files(given: Sequence[Path], on_error: Callable[[OSError], None]) -> list[Path]:
-    """Return the recordings to verify: in place of a folder, all in and below it.
-
-    `on_error`: called for every folder that cannot be read.
-
-    Raises:
-        CommandError: There is none in a folder.
-    """
-    from iris_session.recording.folders import find_recordings
-
-    files: list[Path] = []
-    for path in given:
-        found = find_recordings(path, on_error) if path.is_dir() else [path]
-        if not found:
-            raise CommandError(f"there is no recording below the folder {path}: give a .rrd that `serve` wrote")
-        files += found
-    return files

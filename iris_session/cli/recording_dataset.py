@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from contextlib import redirect_stdout
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import MOST_LINES, CommandError, ending_as_interrupts, make_number_type, print_result
+from iris_session.cli.common import CommandError, ending_as_interrupts, list_first, make_number_type, print_result
 from iris_session.cli.progress import ProgressLine
 from iris_session.cli.recording_render import parse_size
 from iris_session.dataset.formats import FORMATS
 
 if TYPE_CHECKING:
-    from iris_session.dataset.run import DatasetReport
+    pass
 
 LABELS: Final = ("success", "failure", "unknown")
-#: Options that only data sets have, with the values that stand for "not given".
-_OPTIONS: Final = {
-    **dict.fromkeys(("fps", "cameras", "size", "looks", "seed", "labels", "task", "jobs", "ray")),
-    **dict.fromkeys(("plain", "depth", "masks", "anonymise"), False),
-}
+#: Options that only data sets have.
+OPTIONS: Final = (
+    *("fps", "cameras", "size", "looks", "seed", "labels", "task", "jobs", "ray"),
+    *("plain", "depth", "masks", "anonymise"),
+)
 DEFAULT_FPS: Final = 30
 DEFAULT_SIZE: Final = (640, 480)
 
@@ -32,39 +31,29 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("data sets (--to lerobot, robomimic or mcap)")
     whole = make_number_type(int, "a rate: give a whole number of frames a second, for example 30", 1, 1000)
     group.add_argument("--fps", type=whole, metavar="N", help="frames per second of simulated time (default: 30)")
-    group.add_argument(
-        "--cameras",
-        metavar="LIST",
-        help="pictures of every frame: cameras of the model, streams of recorded pictures, NAME=CAMERA, or places "
-        "NAME=X,Y,Z->X,Y,Z:FOVY, separated by commas (default: none)",
+    text = (
+        "pictures of every frame: cameras of the model, streams of recorded pictures, NAME=CAMERA, or places "
+        "NAME=X,Y,Z->X,Y,Z:FOVY, separated by commas (default: none)"
     )
+    group.add_argument("--cameras", metavar="LIST", help=text)
     group.add_argument("--size", type=parse_size, metavar="WxH", help="pixels of a drawn picture (default: 640x480)")
     looks = make_number_type(int, "a number of looks: give 0 to 1000", 0, 1000)
     group.add_argument("--looks", type=looks, metavar="N", help="every episode N more times: other light and colours")
-    group.add_argument(
-        "--seed", type=make_number_type(int, "a seed: give a whole number from 0", 0), metavar="N", help="of the looks"
-    )
+    seed = make_number_type(int, "a seed: give a whole number from 0", 0)
+    group.add_argument("--seed", type=seed, metavar="N", help="of the looks")
     group.add_argument("--plain", action="store_true", help="pictures without shadows: faster without a graphics card")
     group.add_argument("--depth", action="store_true", help="depth of every picture too (robomimic, mcap)")
     group.add_argument("--masks", action="store_true", help="the body of every pixel too (robomimic, mcap)")
-    group.add_argument(
-        "--labels", metavar="LIST", help=f"episodes to export, of {', '.join(LABELS)} (default: success)"
-    )
+    group.add_argument("--labels", metavar="LIST", help=f"episodes, of {', '.join(LABELS)} (default: success)")
     group.add_argument("--task", metavar="TEXT", help="what was to be done, for all episodes")
     group.add_argument("--anonymise", action="store_true", help="p1, p2, ... in place of the names of people")
     jobs = make_number_type(int, "a number of processes: give 1 or more", 1, 1024)
     group.add_argument("--jobs", type=jobs, metavar="N", help="processes, an episode each (default: 1)")
-    group.add_argument(
-        "--ray",
-        metavar="ADDRESS",
-        help="a Ray cluster makes the episodes, a task each: local (this machine), auto, HOST:PORT or ray://HOST:PORT; "
-        "--jobs is then the number of tasks at once",
+    text = (
+        "a Ray cluster makes the episodes, a task each: local (this machine), auto, HOST:PORT or ray://HOST:PORT; "
+        "--jobs is then the number of tasks at once"
     )
-
-
-def list_given(arguments: argparse.Namespace) -> list[str]:
-    """Return the options of data sets that were given."""
-    return [f"--{name}" for name, absent in _OPTIONS.items() if getattr(arguments, name) != absent]
+    group.add_argument("--ray", metavar="ADDRESS", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -107,16 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
     ):
         files = list_files(arguments.paths)
         report = export_dataset(files, arguments.out, arguments.to, options, progress.show, open_pool)
-    print_result(arguments, report, _format(report))
-    return 1 if report.left_out else 0
-
-
-def _format(report: DatasetReport) -> list[str]:
     n = f"{report.episodes:,} episode{'' if report.episodes == 1 else 's'}"
     lines = [f"{report.folder}: {n}, {report.frames:,} frames, {report.format}"]
-    return [*lines, *_first(report.left_out), *_first(report.notes)]
-
-
-def _first(lines: Sequence[str]) -> list[str]:
-    more = len(lines) - MOST_LINES
-    return [*(f"  {line}" for line in lines[:MOST_LINES]), *([f"  and {more} more"] if more > 0 else [])]
+    lines += [f"  {line}" for line in (*list_first(report.left_out), *list_first(report.notes))]
+    return print_result(arguments, report, lines, ok=not report.left_out)

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_command,
     add_json_option,
     ending_as_interrupts,
-    make_number_type,
+    parse_free_port,
+    pick_attributes,
     print_error,
     print_json,
     to_printable,
@@ -32,12 +34,12 @@ WIDTH: Final = 100
 _EDITS: Final = ("drop", "keep", "trim", "label", "task", "reset")
 
 
-def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `episodes` of `recording`."""
+def register(actions: Commands) -> None:
     parser = add_command(
         actions,
         "episodes",
         run,
+        has_json=False,
         help="list the episodes of recordings with their numbers, and choose those that are exported",
         description="List the episodes of recordings: verdict, length, people, handovers, share of time in which no "
         "robot was engaged, clutches, rejected samples, path of each end effector, least distance of two, "
@@ -54,19 +56,14 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         """,
     )
     parser.add_argument("paths", type=Path, nargs="+", metavar="RECORDING", help="recordings, and folders with some")
-    parser.add_argument(
-        "--cameras",
-        metavar="LIST",
-        help="drawn cameras as for `export`: share of time with a gripper out of each picture",
-    )
+    parser.add_argument("--cameras", metavar="LIST", help="as of `export`: share of time with a gripper out of view")
     parser.add_argument("--size", type=parse_size, metavar="WxH", help="of their pictures (default: 640x480)")
     parser.add_argument("--verify", action="store_true", help="simulate every recording again, and mark what differs")
     output = parser.add_mutually_exclusive_group()
-    add_json_option(output)  # type: ignore[arg-type]
+    add_json_option(output)
     output.add_argument("--csv", action="store_true", help="print a table with all numbers, one line an episode")
     output.add_argument("--page", action="store_true", help="list them in a browser on this machine, until Ctrl-C")
-    port = make_number_type(int, "a port: give 0 to 65535", 0, 65535)
-    parser.add_argument("--port", type=port, default=0, metavar="N", help="of the page (default: a free one)")
+    parser.add_argument("--port", type=parse_free_port, default=0, metavar="N", help="of the page (default: any)")
     parser.add_argument("--no-open", action="store_true", help="of the page: print its address only")
     group = parser.add_argument_group("decisions (of one recording)")
     wanted = {
@@ -85,7 +82,6 @@ def run(arguments: argparse.Namespace) -> int:
     """List the episodes, write decisions, or serve the page."""
     from iris_session.system.extras import require_package
 
-    require_package("rerun", "reading recordings")
     if arguments.page:
         require_package("aiohttp", "--page")
         require_package("PIL", "--page")
@@ -122,7 +118,10 @@ def run(arguments: argparse.Namespace) -> int:
 
             return serve_page(found, cameras, arguments.port, opens=not arguments.no_open)
     if arguments.json:
-        print_json(_to_json(found))
+        recordings = [pick_attributes(one, "path", "id", "session_name", "problems") for one in found]
+        episodes = [_to_row(one) for listed in found for one in listed.episodes]
+        ok = not any(one.problems for one in found)
+        print_json({"ok": ok, "episodes": episodes, "recordings": recordings})
     elif arguments.csv:
         _print_csv(found)
     return 1 if any(one.problems for one in found) else 0
@@ -192,14 +191,6 @@ def _to_row(one: ListedEpisode) -> dict[str, Any]:
     import msgspec
 
     return {**msgspec.to_builtins(one), "final_verdict": one.final_verdict}
-
-
-def _to_json(found: Sequence[ListedRecording]) -> dict[str, Any]:
-    recordings = [
-        {"path": one.path, "id": one.id, "session_name": one.session_name, "problems": one.problems} for one in found
-    ]
-    episodes = [_to_row(one) for listed in found for one in listed.episodes]
-    return {"ok": not any(one.problems for one in found), "episodes": episodes, "recordings": recordings}
 
 
 def _print_csv(found: Sequence[ListedRecording]) -> None:

@@ -10,26 +10,27 @@ from typing import Final
 from iris_session.cli import recording_dataset
 from iris_session.cli.common import (
     ABOVE_0,
-    MOST_LINES,
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     ending_as_interrupts,
+    list_first,
     make_number_type,
     print_result,
+    refuse_options,
     report_damage,
 )
 from iris_session.cli.progress import ProgressLine
 from iris_session.dataset.formats import FORMATS as DATASETS
 
-DEFAULT_HZ: Final = 100.0
 #: What `--to` may be: formats of tables, and the other thing that is exported.
 FORMATS: Final = ("csv", "parquet", "npz")
 ASSETS: Final = "assets"
+#: Options that choose tables and their rows.
+_TABLES: Final = ("hz", "robot", "object", "table")
 
 
-def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `export`, and the action of `recording`, which are the same."""
+def register(actions: Commands) -> None:
     parser = add_command(
         actions,
         "export",
@@ -52,44 +53,30 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
             iris-session recording export session.rrd --to assets -o scene-files
         """,
     )
-    parser.add_argument(
-        "paths", type=Path, nargs="+", metavar="RECORDING", help="a .rrd or a folder; for a data set: any number"
-    )
+    text = "a .rrd or folder; for a data set several"
+    parser.add_argument("paths", type=Path, nargs="+", metavar="RECORDING", help=text)
     formats = (*DATASETS, *FORMATS, ASSETS)
     parser.add_argument("--to", required=True, choices=formats, help="format of the data set or tables, or assets")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FOLDER", help="folder for the files")
-    parser.add_argument(
-        "--hz",
-        type=make_number_type(float, "a rate: give rows per second above 0, for example 100", ABOVE_0),
-        metavar="RATE",
-        help="rows per second of robots, objects and commands; at the rate of the session, every step (default: 100)",
-    )
+    text = "rows per second of robots, objects and commands; at the rate of the session, every step (default: 100)"
+    rate = make_number_type(float, "a rate: give rows per second above 0, for example 100", ABOVE_0)
+    parser.add_argument("--hz", type=rate, metavar="RATE", help=text)
     parser.add_argument("--robot", action="append", default=[], metavar="NAME", help="only this robot; repeatable")
     parser.add_argument("--object", action="append", default=[], metavar="NAME", help="only this object; repeatable")
-    parser.add_argument(
-        "--table",
-        action="append",
-        default=[],
-        choices=("robots", "objects", "commands", "samples", "events"),
-        help="only tables of this kind; repeatable",
-    )
+    kinds = ("robots", "objects", "commands", "samples", "events")
+    text = "only tables of this kind; repeatable"
+    parser.add_argument("--table", action="append", default=[], choices=kinds, help=text)
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty, replace its files")
-    add_json_option(parser)
     recording_dataset.add_options(parser)
 
 
 def run_export(arguments: argparse.Namespace) -> int:
     """Write a data set; or the tables, and print a line for each; or the assets."""
-    from iris_session.system.extras import require_package
-
-    require_package("rerun", "reading recordings")
     if arguments.to in DATASETS:
-        given = [f"--{name}" for name in ("hz", "robot", "object", "table", "force") if getattr(arguments, name)]
-        if given:
-            raise CommandError(f"{', '.join(given)} are for tables: leave them out with --to {arguments.to}")
+        refuse_options(arguments, (*_TABLES, "force"), f" are for tables: leave them out with --to {arguments.to}")
         return recording_dataset.run(arguments)
-    if given := recording_dataset.list_given(arguments):
-        raise CommandError(f"{', '.join(given)} are for data sets: leave them out with --to {arguments.to}")
+    why = f" are for data sets: leave them out with --to {arguments.to}"
+    refuse_options(arguments, recording_dataset.OPTIONS, why)
     if len(arguments.paths) > 1:
         raise CommandError(f"--to {arguments.to} takes one recording: give one, or a data set (--to lerobot)")
     arguments.path = arguments.paths[0]
@@ -99,7 +86,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     from iris_session.replay.recorded_session import SessionRecording
 
     options = ExportOptions(
-        DEFAULT_HZ if arguments.hz is None else arguments.hz,
+        arguments.hz or 100.0,
         tuple(arguments.table) or TABLES,
         tuple(arguments.robot),
         tuple(arguments.object),
@@ -125,9 +112,7 @@ def _export_assets(arguments: argparse.Namespace) -> int:
     from iris_session.recording.reader import check_assets
     from iris_session.rrd.assets import export_assets
 
-    given = [f"--{name}" for name in ("hz", "robot", "object", "table") if getattr(arguments, name)]
-    if given:
-        raise CommandError(f"{', '.join(given)} choose tables: leave them out with --to {ASSETS}")
+    refuse_options(arguments, _TABLES, f" choose tables: leave them out with --to {ASSETS}")
     with (
         ending_as_interrupts(),
         ProgressLine(arguments.path) as progress,
@@ -146,6 +131,6 @@ def _export_assets(arguments: argparse.Namespace) -> int:
         damage = (*recording.missing, *recording.damage, *report.damage)
         report = msgspec.structs.replace(report, damage=damage)
     size = f"{report.assets:,} assets, {report.bytes / 1e6:.1f} MB, scenes: {report.scenes:,}"
-    missing = (f"  not recorded: {line}" for line in report.left_out[:MOST_LINES])
+    missing = (f"  not recorded: {line}" for line in list_first(report.left_out))
     print_result(arguments, report, [f"{report.folder}: {size}", *missing])
     return report_damage(arguments.path, report.damage)

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     ending_as_interrupts,
     make_number_type,
     print_result,
     report_damage,
+    writing,
 )
 from iris_session.cli.progress import ProgressLine
 from iris_session.system.files import Replacement
@@ -33,15 +34,12 @@ MAX_SIDE: Final = 8192
 DEFAULT_FPS: Final = 30.0
 #: An animation is held in memory, and its colours are chosen when all of it is there: this many pixels at most.
 MAX_ANIMATION_PIXELS: Final = 100_000_000
-#: Colours of an animation; more make it larger.
-COLOURS: Final = 200
 #: Codecs of a video in the order of preference, by their names in OpenCV: browsers play the first.
 _CODECS: Final = {"vp09": "VP9", "mp4v": "MPEG-4 Part 2, which no browser plays"}
 _SECOND: Final = 1_000_000_000
 
 
-def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the action `render` of `recording`."""
+def register(actions: Commands) -> None:
     parser = add_command(
         actions,
         "render",
@@ -62,27 +60,16 @@ def register(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     )
     parser.add_argument("path", type=Path, metavar="RECORDING", help="a .rrd, or the folder of one session")
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="the file to write: .mp4, .gif or .png")
-    parser.add_argument(
-        "--camera", default="", metavar="NAME", help="camera of the model (default: a view of all bodies that move)"
-    )
+    parser.add_argument("--camera", default="", metavar="NAME", help="camera of the model (default: all that moves)")
     parser.add_argument("--list-cameras", action="store_true", help="print the cameras of the scene, and draw nothing")
-    parser.add_argument(
-        "--size", type=parse_size, default=DEFAULT_SIZE, metavar="WxH", help="pixels (default: 960x540)"
-    )
-    parser.add_argument(
-        "--fps", type=parse_rate, default=DEFAULT_FPS, metavar="N", help="pictures per second (default: 30)"
-    )
-    parser.add_argument(
-        "--speed", type=parse_rate, default=1.0, metavar="N", help="times as fast as it was (default: 1)"
-    )
+    parser.add_argument("--size", type=parse_size, default=DEFAULT_SIZE, metavar="WxH", help="pixels (960x540)")
+    parser.add_argument("--fps", type=parse_rate, default=DEFAULT_FPS, metavar="N", help="pictures per second (30)")
+    parser.add_argument("--speed", type=parse_rate, default=1.0, metavar="N", help="times as fast as it was (1)")
     parser.add_argument("--from", dest="begin", type=parse_time, metavar="S", help="session time to begin at [s]")
     parser.add_argument("--to", dest="end", type=parse_time, metavar="S", help="session time to end at [s]")
-    parser.add_argument(
-        "--at", type=parse_time, metavar="S", help="session time of a .png [s] (default: the middle of the recording)"
-    )
+    parser.add_argument("--at", type=parse_time, metavar="S", help="session time of a .png [s] (default: the middle)")
     parser.add_argument("--people", action="store_true", help="draw heads and hands too, in their colours in `view`")
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
-    add_json_option(parser)
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -105,7 +92,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Draw the pictures, and print what was written."""
     from iris_session.system.extras import require_package
 
-    require_package("rerun", "reading recordings")
     require_package("cv2", "writing pictures")
     from iris_session.recording import Recording
     from iris_session.replay.pictures import PictureOptions, RecordingPictures, Timeline, list_cameras
@@ -165,11 +151,7 @@ def _check_output(arguments: argparse.Namespace) -> Path:
 
 
 def list_times(arguments: argparse.Namespace, timeline: Timeline) -> Sequence[int]:
-    """Return the session times of the pictures [ns], ascending.
-
-    Raises:
-        CommandError: The recording has no such times, or an animation of all of them is too large.
-    """
+    """Return the session times of the pictures [ns], ascending. Raises `CommandError`."""
     first_s, last_s = timeline.begin_ns / _SECOND, timeline.end_ns / _SECOND
     begin_s = first_s if arguments.begin is None else arguments.begin
     end_s = last_s if arguments.end is None else arguments.end
@@ -206,18 +188,18 @@ def _draw(pictures: RecordingPictures, times_ns: Sequence[int], progress: Progre
 
 def _write(out: Path, arguments: argparse.Namespace, images: Iterator[Image], n_images: int) -> str:
     """Write the file, as a whole or not at all. Return the name of its codec."""
+    import cv2
+
     kind = out.suffix.lower()
-    try:
-        with Replacement(out, permissions=None, suffix=kind) as replacement:
-            if kind == VIDEO:
-                return _write_video(replacement.temporary, images, n_images, arguments.size, arguments.fps)
-            if kind == ANIMATION:
-                _write_animation(replacement.file, list(images), round(1000 / arguments.fps))
-                return "GIF"
-            _write_picture(replacement.file, next(images))
-            return "PNG"
-    except OSError as error:
-        raise CommandError(f"{out} cannot be written: {error.strerror or error}") from error
+    with writing(out), Replacement(out, permissions=None, suffix=kind) as replacement:
+        if kind == VIDEO:
+            return _write_video(replacement.temporary, images, n_images, arguments.size, arguments.fps)
+        if kind == ANIMATION:
+            _write_animation(replacement.file, list(images), round(1000 / arguments.fps))
+            return "GIF"
+        _, data = cv2.imencode(PICTURE, next(images)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        replacement.file.write(data.tobytes())
+        return "PNG"
 
 
 def _write_video(path: Path, images: Iterator[Image], n_images: int, size: tuple[int, int], fps: float) -> str:
@@ -259,13 +241,6 @@ def _write_animation(file: BinaryIO, images: Sequence[Image], frame_ms: int) -> 
     from PIL import Image as Pillow
 
     frames = [Pillow.fromarray(image) for image in images]
-    palette = frames[len(frames) // 2].quantize(COLOURS)
+    palette = frames[len(frames) // 2].quantize(colors=200)
     frames = [frame.quantize(palette=palette, dither=Pillow.Dither.NONE) for frame in frames]
     frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=frame_ms, loop=0, optimize=True)
-
-
-def _write_picture(file: BinaryIO, image: Image) -> None:
-    import cv2
-
-    _, data = cv2.imencode(PICTURE, image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    file.write(data.tobytes())

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from iris_session.cli.common import (
     ABOVE_0,
     CommandError,
+    Commands,
+    add_actions,
     add_command,
-    add_json_option,
     make_number_type,
     open_scene,
     print_json,
@@ -41,23 +42,13 @@ class _ParsedScene(NamedTuple):
     notes: tuple[str, ...]
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the commands `robots` and `scene`."""
+def register(commands: Commands) -> None:
     _register_robots(commands)
-    parser = add_command(
+    actions = add_actions(
         commands,
         "scene",
-        None,
         help="inspect what clients receive of a scene, or export it to GLB",
-        description="Inspect what clients receive of a scene, or export it to GLB.",
-        examples="""
-            iris-session scene inspect scene.xml
-            iris-session scene inspect arm.urdf
-            iris-session scene inspect part.stl --scale 0.001    (a part in millimetres)
-            iris-session scene export handover handover.glb
-        """,
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     inspect = add_command(
         actions,
         "inspect",
@@ -70,7 +61,6 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         """,
     )
     _add_scene_arguments(inspect)
-    add_json_option(inspect)
     export = add_command(
         actions,
         "export",
@@ -81,10 +71,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     _add_scene_arguments(export)
     export.add_argument("out", type=Path, metavar="OUT.glb", help="file to write")
-    add_json_option(export)
 
 
-def _register_robots(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_robots(commands: Commands) -> None:
     parser = add_command(
         commands,
         "robots",
@@ -100,7 +89,6 @@ def _register_robots(commands: argparse._SubParsersAction[argparse.ArgumentParse
     )
     parser.add_argument("scene", help="MJCF or MJB file, or the name of a scene (see `iris-session serve --help`)")
     parser.add_argument("--all", action="store_true", help="also legs, heads and fingers, which are not offered")
-    add_json_option(parser)
 
 
 def run_robots(arguments: argparse.Namespace) -> int:
@@ -125,16 +113,13 @@ def run_robots(arguments: argparse.Namespace) -> int:
 
 
 def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scene",
-        metavar="FILE",
-        help="MJCF or MJB file, URDF, GLB, glTF, OBJ, STL, PLY, DAE or another file with geometry, or the name of a "
-        "scene (see `iris-session serve --help`)",
+    text = (
+        "MJCF or MJB file, URDF, GLB, glTF, OBJ, STL, PLY, DAE or another file with geometry, or the name of a "
+        "scene (see `iris-session serve --help`)"
     )
+    parser.add_argument("scene", metavar="FILE", help=text)
     add_file_options(parser)
-    parser.add_argument(
-        "--assets", default=None, metavar="DIR", help="folder of assets (default: ~/.cache/iris-session/assets)"
-    )
+    parser.add_argument("--assets", metavar="DIR", help="folder of assets (default: ~/.cache/iris-session/assets)")
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
@@ -147,8 +132,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     extent = compute_extent(parsed.spec, store)
     found = build_report(parsed.spec, parsed.scene_hash, parsed.skipped, extent)
     result = {**msgspec.to_builtins(found), "notes": parsed.notes}
-    print_result(arguments, result, _format_report(parsed.spec, found, parsed.notes))
-    return 0
+    return print_result(arguments, result, _format_report(parsed.spec, found, parsed.notes))
 
 
 def _format_report(spec: SceneSpec, found: SceneReport, notes: tuple[str, ...]) -> Iterator[str]:
@@ -193,7 +177,7 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise CommandError(f"{out} is the input file: give another output file")
     with files_read() as files:
         parsed, store = _parse_scene(arguments)
-    if any(_is_same_file(path, out) for path in (*files, *_list_model_files(arguments.scene))):
+    if any(_is_same_file(path, out) for path in files):
         raise CommandError(f"{out} is part of {arguments.scene}: give another output file")
     try:
         size = write_glb(parsed.spec, store, out)
@@ -216,17 +200,6 @@ def run_export(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _list_model_files(scene: str) -> list[Path]:
-    """Return the files that an MJCF file refers to."""
-    path = expand_path(scene)
-    if path.suffix.lower() not in (".xml", ".mjcf") or not path.is_file():
-        return []
-    import mujoco
-
-    names = getattr(mujoco, "mju_getXMLDependencies", None)  # since MuJoCo 3.3.7
-    return [] if names is None else [Path(name) for name in names(str(path))]
-
-
 def _is_same_file(a: Path, b: Path) -> bool:
     """Return whether both paths are one file, also by a link or in another spelling."""
     try:
@@ -243,7 +216,10 @@ def _parse_scene(arguments: argparse.Namespace) -> tuple[_ParsedScene, AssetStor
     check_file_options(arguments, path)
     try:
         store = AssetStore(arguments.assets)
-        return _parse_model(arguments.scene, store) if path is None else _compose_file(path, arguments, store), store
+        if path is None:
+            return _parse_model(arguments.scene, store), store
+        made = make_builder(path, path.stem, arguments).build(store)
+        return _ParsedScene(made.spec, made.scene_hash, made.skipped, made.notes), store
     except OSError as error:
         raise CommandError(f"assets cannot be stored: {error} (choose another folder with --assets DIR)") from None
 
@@ -259,38 +235,20 @@ def _parse_model(scene: str, store: AssetStore) -> _ParsedScene:
     return _ParsedScene(parsed.spec, parsed.scene_hash, parsed.skipped, check_model_units(parsed.spec))
 
 
-def _compose_file(path: Path, arguments: argparse.Namespace, store: AssetStore) -> _ParsedScene:
-    made = make_builder(path, path.stem, arguments).build(store)
-    return _ParsedScene(made.spec, made.scene_hash, made.skipped, made.notes)
-
-
 def _format_size(n_bytes: int) -> str:
     return f"{n_bytes / 1e6:.1f} MB" if n_bytes >= 100_000 else f"{n_bytes / 1e3:.1f} kB"
 
 
 #: Suffixes of files that MuJoCo simulates; any other file is composed and shown as it is.
 SIMULATED: Final = (".xml", ".mjcf", ".mjb")
-#: Limits above which work takes longer than about a second and progress is printed.
-_LARGE_FILE_BYTES: Final = 5_000_000
-_MANY_TRIANGLES: Final = 100_000
 
 
 def add_file_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--package-dir",
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="folder of packages that the file refers to by package://, or may refer into; repeatable",
-    )
-    parser.add_argument(
-        "--scale",
-        type=make_number_type(
-            float, "a factor: give a number above 0, for example 0.001 for a file in millimetres", ABOVE_0
-        ),
-        metavar="FACTOR",
-        help="scale of the file: 0.001 for millimetres; not for MJCF and MJB, which are simulated",
-    )
+    text = "folder of packages that the file refers to by package://, or may refer into; repeatable"
+    parser.add_argument("--package-dir", action="append", default=[], metavar="DIR", help=text)
+    wanted = "a factor: give a number above 0, for example 0.001 for a file in millimetres"
+    text = "scale of the file: 0.001 for millimetres; not for MJCF and MJB, which are simulated"
+    parser.add_argument("--scale", type=make_number_type(float, wanted, ABOVE_0), metavar="FACTOR", help=text)
     parser.add_argument("--collisions", action="store_true", help="of a URDF: draw collision shapes, not visuals")
 
 
@@ -303,11 +261,7 @@ def expand_path(text: str | Path) -> Path:
 
 
 def find_scene_file(scene: str) -> Path | None:
-    """Return the file to show, or `None` if the scene is for MuJoCo: a model, or a name.
-
-    Raises:
-        CommandError: It is a folder, or a file that does not exist or has an unknown suffix.
-    """
+    """Return the file to show, `None` if the scene is for MuJoCo: a model, or a name. Raises `CommandError`."""
     from iris_session.demo.scene_names import SCENE_NAMES
     from iris_session.scene.importers.references import ENDINGS, check_present, xacro_advice
 
@@ -349,7 +303,7 @@ def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneB
     from iris_session.scene.builder import SceneBuilder
 
     builder, scale = SceneBuilder(name), 1.0 if arguments.scale is None else arguments.scale
-    if (size := path.stat().st_size) > _LARGE_FILE_BYTES:
+    if (size := path.stat().st_size) > 5_000_000:  # more than about a second
         print(f"reading {path.name} ({size / 1e6:.1f} MB)", file=sys.stderr, flush=True)
     try:
         if path.suffix.lower() == ".urdf":
@@ -359,7 +313,7 @@ def make_builder(path: Path, name: str, arguments: argparse.Namespace) -> SceneB
     except SceneBuildError as error:
         advice = " (here: --package-dir DIR)" if "package_dirs" in str(error) else ""
         raise CommandError(f"{error}{advice}") from None
-    if builder.triangles > _MANY_TRIANGLES:
+    if builder.triangles > 100_000:
         text = f"preparing meshes of {path.name} ({builder.triangles:,} triangles; cached for the next time)"
         print(text, file=sys.stderr, flush=True)
     return builder

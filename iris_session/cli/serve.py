@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_command,
-    add_json_option,
     add_session_options,
     format_scene_names,
     open_scene,
     parse_seconds,
     print_error,
     print_json,
+    refuse_options,
 )
 from iris_session.cli.scene import add_file_options, check_file_options, find_scene_file, make_builder
 from iris_session.cli.view import live_viewer
@@ -31,6 +32,8 @@ URDF_ADVICE: Final = (
     "to drive it: mujoco.MjSpec.from_file, spec.add_actuator for each joint, spec.to_xml, and serve that .xml "
     "(docs/robots.md)"
 )
+#: Options about who drives what.
+_DRIVES: Final = ("robots", "assign", "unaligned", "assignment", "mode")
 #: What `bench record` and `demo handover` cost.
 RECORDING_COST: Final = "some 20 MB an hour at rest, 0.7 GB and more with two operators; `iris-session status`: now"
 
@@ -40,8 +43,7 @@ if TYPE_CHECKING:
     from iris_session.session.session import Session
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `serve`."""
+def register(commands: Commands) -> None:
     parser = add_command(
         commands,
         "serve",
@@ -67,68 +69,29 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         notes=format_scene_names(),
     )
     parser.add_argument("scene", nargs="?", help="MJCF or MJB file, a file to show, or the name of a scene, see below")
-    parser.add_argument(
-        "--robots",
-        metavar="WHICH",
-        help="a robots file (.toml; see `iris-session robots`), names of robots found, separated by commas, `none`, or "
-        "`auto` (default)",
+    text = (
+        "a robots file (.toml; see `iris-session robots`), names of robots found, separated by commas, `none`, or "
+        "`auto` (default)"
     )
-    parser.add_argument(
-        "--anchors",
-        type=Path,
-        metavar="TOML",
-        help="poses of sheets and other anchors, instead of the scene's; see `iris-session anchors example`",
-    )
-    parser.add_argument(
-        "--assign",
-        action="append",
-        default=[],
-        metavar="NAME=ROBOT[,ROBOT]",
-        help="robots of a participant, repeatable; implies --assignment config",
-    )
-    parser.add_argument(
-        "--unaligned",
-        action="append",
-        default=[],
-        metavar="WHO",
-        help="a role, device or key:FINGERPRINT that may drive without an alignment too, repeatable (remote VR)",
-    )
-    parser.add_argument(
-        "--camera",
-        action="append",
-        default=[],
-        type=Path,
-        metavar="TOML",
-        help="depth cameras to show as a point cloud, repeatable; see `iris-session cloud example`",
-    )
-    parser.add_argument(
-        "--task",
-        type=Path,
-        metavar="TOML",
-        help="task whose episodes are recorded; its progress is kept beside the file",
-    )
-    parser.add_argument(
-        "--picture",
-        action="append",
-        default=[],
-        metavar="CAMERA[:WxH][@HZ]",
-        help="a camera of the model whose pictures clients get, repeatable (top:320x240@30 is top with the defaults)",
-    )
-    parser.add_argument(
-        "--plain-pictures",
-        action="store_true",
-        help="draw them without shadows, reflections and smooth edges: faster without a graphics card",
-    )
-    parser.add_argument(
-        "--resume",
-        type=Path,
-        metavar="RECORDING",
-        help="continue at the end of a recording (a .rrd or its folder): same session, participants, leases, scene",
-    )
+    parser.add_argument("--robots", metavar="WHICH", help=text)
+    text = "poses of sheets and other anchors, instead of the scene's; see `iris-session anchors example`"
+    parser.add_argument("--anchors", type=Path, metavar="TOML", help=text)
+    text = "robots of a participant, repeatable; implies --assignment config"
+    parser.add_argument("--assign", action="append", default=[], metavar="NAME=ROBOT[,ROBOT]", help=text)
+    text = "a role, device or key:FINGERPRINT that may drive without an alignment too, repeatable (remote VR)"
+    parser.add_argument("--unaligned", action="append", default=[], metavar="WHO", help=text)
+    text = "depth cameras to show as a point cloud, repeatable; see `iris-session cloud example`"
+    parser.add_argument("--camera", dest="cameras", action="append", type=Path, metavar="TOML", help=text)
+    parser.add_argument("--task", type=Path, metavar="TOML", help="task of the episodes; progress is kept beside it")
+    text = "a camera of the model whose pictures clients get, repeatable (top:320x240@30 is top with the defaults)"
+    parser.add_argument("--picture", dest="pictures", action="append", metavar="CAMERA[:WxH][@HZ]", help=text)
+    text = "draw them without shadows, reflections and smooth edges: faster without a graphics card"
+    parser.add_argument("--plain-pictures", action="store_true", help=text)
+    text = "continue at the end of a recording (a .rrd or its folder): same session, participants, leases, scene"
+    parser.add_argument("--resume", type=Path, metavar="RECORDING", help=text)
     add_file_options(parser)
     parser.add_argument("--seconds", type=parse_seconds, help="stop after this many seconds")
     add_session_options(parser)
-    add_json_option(parser)
 
 
 def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConfig:
@@ -138,14 +101,13 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
     from iris_session.authority import AuthorityConfig
     from iris_session.session.config import SessionConfig
 
-    if arguments.view and arguments.no_record:
-        raise CommandError("--view shows the recording: leave --no-record out")
-    if arguments.no_record and arguments.record:
-        raise CommandError("--record and --no-record contradict each other: leave one out")
-    if arguments.record and not arguments.record.endswith(".rrd"):
-        raise CommandError(f"--record {arguments.record}: a recording is one file: give a name that ends in .rrd")
-    if arguments.no_record and (arguments.record_assets or arguments.record_budget):
-        raise CommandError("--record-assets and --record-budget are for a recording: leave --no-record out")
+    if arguments.record is False:
+        if arguments.view:
+            raise CommandError("--view shows the recording: leave --no-record out")
+        if arguments.record_assets or arguments.record_budget_bytes:
+            raise CommandError("--record-assets and --record-budget are for a recording: leave --no-record out")
+    if arguments.interfaces and arguments.host:
+        raise CommandError("--interface and --host both set where to listen: give one of them")
     assigned = parse_assignments(getattr(arguments, "assign", []))
     policy = arguments.assignment or (AssignmentPolicy.CONFIG if assigned else None)
     if assigned and policy != AssignmentPolicy.CONFIG:
@@ -153,41 +115,14 @@ def make_session_config(arguments: argparse.Namespace, name: str) -> SessionConf
     changes = {"policy": policy, "default_mode": arguments.mode, "assignments": assigned or None}
     changes["unaligned"] = parse_unaligned(getattr(arguments, "unaligned", []))
     authority = msgspec.structs.replace(AuthorityConfig(), **{k: v for k, v in changes.items() if v is not None})
-    if arguments.interface and arguments.host != SessionConfig().host:
-        raise CommandError("--interface and --host both set where to listen: give one of them")
-    base = arguments.port_base
-    if base is not None and (arguments.control_port or arguments.state_port):
-        raise CommandError("--port-base sets all ports: give it without --control-port and --state-port")
-    given: dict[str, Any] = {
-        "control_port": arguments.control_port if base is None else base + 1,
-        "state_port": arguments.state_port if base is None else base + 2,
-        "beacon_port": 0 if arguments.no_beacon else None,
-        "record_clouds_hz": arguments.record_clouds,
-        "record_assets": arguments.record_assets,
-    }
-    return SessionConfig(
-        name=arguments.name or name,
-        host=arguments.host,
-        interfaces=tuple(arguments.interface),
-        advertise=arguments.advertise,
-        record=False if arguments.no_record else arguments.record or True,
-        record_budget_bytes=arguments.record_budget or 0,
-        curve=arguments.curve,
-        curve_key=arguments.curve_key,
-        curve_clients=arguments.curve_clients,
-        web=not arguments.no_web,
-        web_port=arguments.web_port,
-        web_cert=arguments.web_cert,
-        web_key=arguments.web_key,
-        cameras=tuple(getattr(arguments, "camera", ())),
-        task=getattr(arguments, "task", None),
-        pictures=tuple(getattr(arguments, "picture", ())),
-        plain_pictures=getattr(arguments, "plain_pictures", False),
-        groups=arguments.groups,
-        sites=arguments.sites,
-        authority=authority,
-        **{name: value for name, value in given.items() if value is not None},
-    )
+    fields = {field.name for field in dataclasses.fields(SessionConfig)} - {"anchors", "name"}
+    given: dict[str, Any] = {k: v for k, v in vars(arguments).items() if k in fields and v is not None}
+    if arguments.port_base is not None:
+        if arguments.control_port or arguments.state_port:
+            raise CommandError("--port-base sets all ports: give it without --control-port and --state-port")
+        given |= {"control_port": arguments.port_base + 1, "state_port": arguments.port_base + 2}
+    given |= {k: tuple(v) for k, v in given.items() if isinstance(v, list)}
+    return SessionConfig(arguments.name or name, **given, authority=authority)
 
 
 def parse_assignments(options: list[str]) -> dict[str, tuple[str, ...]]:
@@ -236,9 +171,7 @@ def create_publisher(arguments: argparse.Namespace, path: Path) -> ScenePublishe
     """Return a publisher that shows a file in which nothing moves."""
     from iris_session.session.scene_publisher import ScenePublisher
 
-    drives = ("robots", "assign", "unaligned", "assignment", "mode", "task")
-    if given := [f"--{name}" for name in drives if getattr(arguments, name)]:
-        raise CommandError(f"{', '.join(given)}: {path.name} has no robots, it is shown as it is")
+    refuse_options(arguments, (*_DRIVES, "task"), f": {path.name} has no robots, it is shown as it is")
     scene = make_builder(path, path.name, arguments)
     config = apply_anchors_file(make_session_config(arguments, make_session_name(path)), arguments.anchors)
     return ScenePublisher(scene, config)
@@ -248,12 +181,11 @@ def resume_session(arguments: argparse.Namespace) -> Session:
     """Return a session that continues a recording."""
     from iris_session.session.session import Session
 
-    had = ("robots", "assign", "unaligned", "assignment", "mode", "record", "no_record")
-    given = [f"--{name.replace('_', '-')}" for name in had if getattr(arguments, name)]
-    if given:
-        raise CommandError(f"{', '.join(given)} cannot be combined with --resume: the recording defines them")
+    refuse_options(arguments, _DRIVES, " cannot be combined with --resume: the recording defines them")
+    if arguments.record is not None:
+        raise CommandError("--record and --no-record cannot be combined with --resume: the recording goes on")
     model = None if arguments.scene is None else open_scene(arguments.scene).model
-    config = dataclasses.replace(make_session_config(arguments, "session"), resume=arguments.resume)
+    config = make_session_config(arguments, "session")
     return Session(model, config=apply_anchors_file(config, arguments.anchors))
 
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
-    add_json_option,
     list_first,
     make_client,
     parse_seconds,
@@ -33,8 +33,7 @@ JOIN_S: Final = 4.0
 FIRST_REPORT_S: Final = 1.2
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the commands `sessions` and `status`."""
+def register(commands: Commands) -> None:
     _register_sessions(commands)
     parser = add_command(
         commands,
@@ -54,10 +53,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     add_watch_options(form, parser)
     form.add_argument("--prometheus", action="store_true", help="print metrics in the text format of Prometheus, once")
     form.add_argument("--metrics-port", type=int, metavar="PORT", help="serve the metrics on 127.0.0.1 over HTTP")
-    add_json_option(parser)
 
 
-def _register_sessions(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _register_sessions(commands: Commands) -> None:
     parser = add_command(
         commands,
         "sessions",
@@ -71,7 +69,6 @@ def _register_sessions(commands: argparse._SubParsersAction[argparse.ArgumentPar
         """,
     )
     parser.add_argument("--seconds", type=parse_seconds, default=1.0, help="listen this long (default: %(default)g)")
-    add_json_option(parser)
 
 
 def run_sessions(arguments: argparse.Namespace) -> int:
@@ -86,8 +83,7 @@ def run_sessions(arguments: argparse.Namespace) -> int:
     rows = [pick_attributes(one, *names) | mark for one, mark in zip(found, marks, strict=True)]
     lines = [f"{row['name']:<24} {row['address']:<24} {row['kind']:<8} {_format_key(row)}" for row in rows]
     none = "no session was heard: type the address of a session, or scan its code (docs/network.md)"
-    print_result(arguments, {"ok": bool(rows), "sessions": rows}, lines or [none])
-    return 0 if rows else 1
+    return print_result(arguments, {"ok": bool(rows), "sessions": rows}, lines or [none], ok=bool(rows))
 
 
 def _format_key(row: dict[str, object]) -> str:
@@ -99,13 +95,8 @@ def _format_key(row: dict[str, object]) -> str:
 def add_watch_options(group: argparse._ActionsContainer, parser: argparse.ArgumentParser) -> None:
     """Add `--watch` to `group`, and `--period` to `parser`."""
     group.add_argument("--watch", action="store_true", help="repeat until Ctrl-C")
-    parser.add_argument(
-        "--period",
-        type=parse_seconds,
-        default=1.0,
-        metavar="S",
-        help="--watch: seconds between two reports (default: %(default)s)",
-    )
+    text = "--watch: seconds between two reports (default: %(default)s)"
+    parser.add_argument("--period", type=parse_seconds, default=1.0, metavar="S", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -123,10 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def open_status(arguments: argparse.Namespace) -> Iterator[tuple[Client, StatusReport]]:
-    """Join a session as an observer. Yield the client and the status.
-
-    A stalled session admits no participant, but answers a request for its status.
-    """
+    """Join a session as an observer. Yield the client and the status, which a stalled session answers, too."""
     from iris_session.client import NotConnectedError, RequestTimeoutError
 
     client = make_client(arguments, "observer", "status")

@@ -18,8 +18,11 @@ from urllib.parse import quote
 from iris_session.cli.common import (
     MOST_LINES,
     CommandError,
+    Commands,
     add_command,
     ending_as_interrupts,
+    make_number_type,
+    name_first,
     print_error,
     to_printable,
 )
@@ -37,18 +40,14 @@ END_S: Final = 3.0
 POLL_S: Final = 0.05
 #: Memory that the server of a page may take at least, in bytes: Rerun's default.
 MIN_MEMORY: Final = 1 << 30
-#: Added to the nice value of a viewer beside a session that runs.
-LIVE_NICE: Final = 10
-#: Bytes of the messages of a viewer that has failed.
-MOST_WORDS: Final = 10_000
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `view`."""
+def register(commands: Commands) -> None:
     parser = add_command(
         commands,
         "view",
         run,
+        has_json=False,
         help="show a recording in Rerun's viewer",
         description="Show a recording in Rerun's viewer: the whole session, with its parts and resumed recordings, "
         "also if it was killed, cut or damaged. A copy that opens at once is kept beside it (session.view.rrd); the "
@@ -61,25 +60,14 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
             iris-session view --live                   follow the session that runs
         """,
     )
-    parser.add_argument(
-        "path",
-        nargs="?",
-        type=Path,
-        metavar="RECORDING",
-        help="a .rrd of a session, or a folder: the newest session in or below it (default: the folder sessions)",
-    )
+    text = "a .rrd of a session, or a folder: the newest session in or below it (default: the folder sessions)"
+    parser.add_argument("path", nargs="?", type=Path, metavar="RECORDING", help=text)
     parser.add_argument("--web", action="store_true", help="in a browser; the default where there is no display")
-    parser.add_argument(
-        "--no-open", action="store_true", help="open no window: only make the copy, or with --web serve the page"
-    )
+    parser.add_argument("--no-open", action="store_true", help="only make the copy, or with --web serve the page")
     parser.add_argument("--live", action="store_true", help="follow a session that runs, as it is recorded")
-    parser.add_argument(
-        "--port",
-        type=int,
-        default=0,
-        metavar="N",
-        help="port of the viewer; with --web of the page, which gets its data from port N+1 (default: free ones)",
-    )
+    port = make_number_type(int, "a port: give 1 to 65534, or 0 for a free one", 0, 65534)
+    text = "port of the viewer; with --web of the page, which gets its data from port N+1 (default: free ones)"
+    parser.add_argument("--port", type=port, default=0, metavar="N", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -87,15 +75,13 @@ def run(arguments: argparse.Namespace) -> int:
     from iris_session.recording.viewer_export import open_view_file
     from iris_session.rrd.rerun_tool import find_rerun
 
-    if not 0 <= arguments.port < 65535:
-        raise CommandError(f"--port {arguments.port} is not a port: give 1 to 65534")
     taken = [port for port in (arguments.port, arguments.port + 1) if arguments.port and _is_open(port)]
     if taken:  # Rerun would send the recording to a viewer that listens there
         raise CommandError(f"something listens on port {taken[0]} already: give another one, or leave --port out")
     tool = find_rerun()
     if arguments.live:
         live = find_live(arguments.path or DEFAULT_FOLDER)
-        os.nice(LIVE_NICE)  # the session comes first
+        os.nice(10)  # the session comes first
         print(f"follows {to_printable(str(live))} until the session ends", flush=True)
         with ending_as_interrupts():
             return _show(tool, arguments, None, live)
@@ -112,11 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def find_live(path: Path) -> Path:
-    """Return the first file of a recording that is being written: of a session, or the newest in or below a folder.
-
-    Raises:
-        CommandError: There is none.
-    """
+    """Return the first file of a recording that is being written, the newest of a folder. Raises `CommandError`."""
     from iris_session.recording.folders import find_newest_s, find_recordings, list_session_files
     from iris_session.recording.lock import is_being_written
 
@@ -130,20 +112,13 @@ def find_live(path: Path) -> Path:
 
 
 def choose_recording(path: Path) -> Path:
-    """Return the recording to show. The newest of a folder; the others are listed.
+    """Return the recording to show: the newest of a folder, whose others are printed. Raises `CommandError`."""
+    from iris_session.dataset.episodes import list_files
+    from iris_session.recording.folders import find_newest_s, group_by_session
 
-    Raises:
-        CommandError: There is none.
-    """
+    found = list_files([path], lambda error: print_error(str(error)))
     if not path.is_dir():
-        if not path.exists():
-            raise CommandError(f"{path} does not exist: give a recording (session.rrd), or a folder with recordings")
         return path
-    from iris_session.recording.folders import find_newest_s, find_recordings, group_by_session
-
-    found = find_recordings(path, lambda error: print_error(str(error)))
-    if not found:
-        raise CommandError(f"there is no recording below the folder {path}: give a .rrd that `serve` or `demo` wrote")
     newest = group_by_session(found)
     if len(newest) > 1:
         print(f"{len(newest)} sessions below {to_printable(str(path))}, the newest is shown; the others:")
@@ -163,8 +138,7 @@ def _print_file(view: ViewFile) -> None:
         lines.append(f"{'made' if view.made else 'uses'} the copy {view.path} ({size:.1f} MB)")
     lines += view.notes
     if view.damage:
-        more = f" (and {len(view.damage) - 1} more)" if len(view.damage) > 1 else ""
-        lines.append(f"DAMAGED: {view.damage[0]}{more}; see `iris-session recording inspect`")
+        lines.append(f"DAMAGED: {name_first(view.damage)}; see `iris-session recording inspect`")
     print("\n".join(map(to_printable, lines)), flush=True)
 
 
@@ -203,7 +177,7 @@ def _wait_until_open(port: int, process: subprocess.Popen[bytes]) -> None:
     deadline = time.monotonic() + START_S
     while not _is_open(port):
         if (status := process.poll()) is not None:
-            raise CommandError(f"Rerun's viewer ended with exit status {status}: its messages are above", 1)
+            raise _make_viewer_error(status)
         if time.monotonic() > deadline:
             raise CommandError(f"Rerun's viewer did not listen on port {port} within {START_S:g} s", 1)
         time.sleep(POLL_S)
@@ -242,7 +216,7 @@ def live_viewer(recording: Path | None, out: TextIO) -> Iterator[None]:
             yield
             if viewer.exit_status:
                 words.seek(0)
-                print(words.read(MOST_WORDS).decode(errors="replace").strip(), file=sys.stderr)
+                print(words.read(10_000).decode(errors="replace").strip(), file=sys.stderr)
         finally:
             viewer.close(terminate_s=END_S + 1.0)
 
@@ -254,8 +228,12 @@ def _wait(process: subprocess.Popen[bytes]) -> int:
     except KeyboardInterrupt:
         return 0
     if status:
-        raise CommandError(f"Rerun's viewer ended with exit status {status}: its messages are above", 1)
+        raise _make_viewer_error(status)
     return 0
+
+
+def _make_viewer_error(status: int) -> CommandError:
+    return CommandError(f"Rerun's viewer ended with exit status {status}: its messages are above", 1)
 
 
 @contextmanager
@@ -265,15 +243,14 @@ def _started(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 
     # In a group of its own, so that Ctrl-C reaches this process alone, which then ends it in order.
     process = subprocess.Popen(command, env=make_environment(), process_group=0, stdin=subprocess.DEVNULL)
-    try:
-        yield process
-    finally:
-        process.terminate()
+    with process:
         try:
-            process.wait(END_S)
-        except subprocess.TimeoutExpired:
+            yield process
+        finally:
+            process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(END_S)
             process.kill()
-            process.wait()
 
 
 def _find_free_port() -> int:

@@ -6,10 +6,12 @@ import argparse
 
 from iris_session.cli.common import (
     CommandError,
+    Commands,
     add_address_options,
     add_command,
     add_page_options,
     check_session_reachable,
+    parse_port,
     print_error,
 )
 from iris_session.system.extras import require_package
@@ -17,12 +19,12 @@ from iris_session.system.extras import require_package
 CONNECT_S = 15.0
 
 
-def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command `web`."""
+def register(commands: Commands) -> None:
     parser = add_command(
         commands,
         "web",
         run,
+        has_json=False,
         help="serve the page for browsers for a session on another machine",
         description="Serve the page for browsers, and the gateway behind it, for a session on another machine. A "
         "session of this machine does so by itself. At an encrypted session the key of this user must be allowed in "
@@ -34,12 +36,9 @@ def register(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         """,
     )
     add_address_options(parser)
-    parser.add_argument(
-        "--host",
-        metavar="ADDR",
-        help="address to listen on (default: all addresses; 127.0.0.1 if the session is not encrypted)",
-    )
-    add_page_options(parser)
+    text = "address to listen on (default: all addresses; 127.0.0.1 if the session is not encrypted)"
+    parser.add_argument("--host", metavar="ADDR", help=text)
+    add_page_options(parser, parse_port)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -58,8 +57,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     if bool(arguments.web_cert) != bool(arguments.web_key):
         raise CommandError("--web-cert and --web-key belong together: give both, or none")
-    if arguments.web_port is not None and not 0 < arguments.web_port < 65536:
-        raise CommandError(f"--web-port {arguments.web_port} is not a port: give 1 to 65535")
     check_session_reachable(arguments)
     request = parse_connect_request(arguments.address, arguments.session, None, arguments.code)
     endpoint = resolve_blocking(request, CONNECT_S)

@@ -120,21 +120,24 @@ class PlanOptions(msgspec.Struct, frozen=True):
     anonymise: bool = False
 
 
-def list_files(given: Sequence[Path]) -> list[Path]:
+def refuse_folder(error: OSError) -> None:
+    """Raise `DatasetError` for a folder that cannot be read."""
+    raise DatasetError(f"the folder {error.filename} cannot be read: {error.strerror}") from error
+
+
+def list_files(given: Sequence[Path], on_error: Callable[[OSError], None] = refuse_folder) -> list[Path]:
     """Return the recordings that files and folders name, each once, in the order of their names within a folder.
 
+    `on_error`: called for every folder that cannot be read.
+
     Raises:
-        DatasetError: Something does not exist, cannot be read, or a folder has no recording.
+        DatasetError: Something does not exist, or a folder has no recording.
     """
-
-    def refuse(error: OSError) -> None:
-        raise DatasetError(f"the folder {error.filename} cannot be read: {error.strerror}") from error
-
     files: dict[str, Path] = {}
     for path in given:
-        if not path.exists():
+        if not os.path.exists(path):
             raise DatasetError(f"{path} does not exist: give a recording (session.rrd), or a folder with recordings")
-        found = find_recordings(path, refuse) if path.is_dir() else [path]
+        found = find_recordings(path, on_error) if path.is_dir() else [path]
         if not found:
             raise DatasetError(f"there is no recording below the folder {path}: give one with .rrd files")
         files |= {os.path.realpath(one): one for one in found}

@@ -48,7 +48,7 @@ def check_alarms(people: tuple[ParticipantReport, ...]) -> Finding:
         if r is None or not r.alarm:
             continue
         what = ALARMS.get(r.alarm, r.alarm)
-        texts.append(f"{p.name}: {what}, by {r.alarm_size_m * 1e3:.0f} mm, {_format_age(r.alarm_ns)} ago")
+        texts.append(f"{p.name}: {what}, by {r.alarm_size_m * 1e3:.0f} mm, {format_age(r.alarm_ns)} ago")
         if r.alarm == AlarmKind.JUMP:
             state = FAILED  # it has voided the alignment: no robot that `p` holds moves
     why = "the headset was bumped, recentred or lost its tracking, or a sheet was moved"
@@ -70,9 +70,9 @@ def check_staleness(people: tuple[ParticipantReport, ...]) -> Finding:
             texts.append(f"the alignment of {p.name} is unconfirmed ({r.doubt}): its robots hold at the next clutch")
         elif r.confirmed_ns > GLANCE_NS and r.error_at_robot_m > GLANCE_ERROR_M:
             error = f"{r.error_at_robot_m * 1e3:.0f} mm at the robot"
-            texts.append(f"{p.name} has confirmed its alignment {_format_age(r.confirmed_ns)} ago: {error}")
+            texts.append(f"{p.name} has confirmed its alignment {format_age(r.confirmed_ns)} ago: {error}")
         elif seen_ns > STALE_NS:
-            texts.append(f"{p.name} has seen no sheet for {_format_age(seen_ns)}")
+            texts.append(f"{p.name} has seen no sheet for {format_age(seen_ns)}")
     fine = "measured alignments were confirmed recently"
     why = "tracking frames drift by millimetres a minute, and a later look may contradict an alignment"
     return report_problems("stale", texts, fine, why, "glance at a sheet now and then")
@@ -139,6 +139,7 @@ def check_pairs(people: tuple[ParticipantReport, ...], pairs: tuple[UnverifiedRe
     )
 
 
-def _format_age(duration_ns: Nanoseconds) -> str:
+def format_age(duration_ns: Nanoseconds) -> str:
+    """Return a duration as seconds or minutes."""
     seconds = duration_ns * 1e-9
     return f"{seconds:.1f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"

@@ -25,9 +25,13 @@ from iris_session.emulator.specs import HeadsetReport, HeadsetSpec
 LISTS: Final = frozenset({"eye", "gaze", "recentre_at_s", "bump_at_s", "bump_m"})
 
 
-def main(argv: list[str] | None = None, prog: str = "emulator") -> int:
+def main(argv: list[str] | None = None) -> int:
+    """Run the headsets of a command line."""
+    return run(_build_parser().parse_args(argv), "emulator")
+
+
+def run(options: argparse.Namespace, prog: str) -> int:
     """Return exit status 0 when all succeeded, 1 when one failed, 2 for unusable input. Errors begin with `prog`."""
-    options = _build_parser().parse_args(argv)
     try:
         specs = _parse_specs(options)
         sought = parse_connect_request(options.address, options.session, None, options.code)

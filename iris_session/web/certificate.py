@@ -14,12 +14,13 @@ import os
 import socket
 import ssl
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from iris_session.security import KeyHome, KeysError
-from iris_session.system.extras import require_package
+from iris_session.system.extras import MissingExtraError, require_package
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -79,12 +80,16 @@ def load_or_make_certificate(home: KeyHome, addresses: Iterable[str]) -> Certifi
 
 
 def find_certificate(home: KeyHome) -> Certificate | None:
-    """Return the certificate of the key home, `None` while there is none. Raises as `load_or_make_certificate`."""
+    """Return the certificate of the key home, `None` while there is none or `cryptography` is not installed.
+
+    Raises `KeysError` as `load_certificate`.
+    """
     data = home.folder.read(CERTIFICATE_FILE)
     if data is None or home.folder.read(KEY_FILE) is None:
         return None
-    require_package("cryptography", _PURPOSE)
-    return load_certificate(home.path / CERTIFICATE_FILE, home.path / KEY_FILE)
+    with suppress(MissingExtraError):
+        return load_certificate(home.path / CERTIFICATE_FILE, home.path / KEY_FILE)
+    return None
 
 
 def load_certificate(

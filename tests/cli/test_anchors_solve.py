@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,15 +11,14 @@ from anchors.alignment import AlignmentEstimate
 from anchors.constellation import Constellation
 from anchors.pose import PoseTuple, compose, distance, inverse
 from iris_session.alignment.smoother import AlignmentSmoother, AnchorHistory, fuse_estimates
-from iris_session.cli.main import main
 from iris_session.protocol.common import IDENTITY, Alignment, Pose
 from iris_session.protocol.server_messages import AnchorMoved
 from iris_session.recording import Recording, TrackingFrame, read_alignment_history
 from iris_session.session.config import load_anchors
 from tests.anchors.worlds import shifted, tracking_frame
+from tests.cli.conftest import CommandLine
 from tests.recording.headsets import Played
 
-Capture = pytest.CaptureFixture[str]
 TRUE: dict[str, PoseTuple] = {
     "table": ((0.0, -0.45, 0.0), (1.0, 0.0, 0.0, 0.0)),
     "door": ((1.2, 0.1, 0.3), (0.7071067811865476, 0.0, 0.0, 0.7071067811865476)),
@@ -62,14 +59,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return play().write(tmp_path_factory.mktemp("solve") / "session.rrd")
 
 
-def solve(capsys: Capture, *words: str) -> dict[str, Any]:
-    assert main(["anchors", "solve", *words, "--json"]) == 0
-    result: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return result
-
-
-def test_alignments_are_solved_again_and_compared(recording: Path, capsys: Capture) -> None:
-    result = solve(capsys, str(recording))
+def test_alignments_are_solved_again_and_compared(recording: Path, cli: CommandLine) -> None:
+    result = cli.json("anchors", "solve", recording)
     ann, bob, carl = result["participants"]
     for person in (ann, bob):
         (outlier,) = person["frames"][0]["outliers"]
@@ -90,17 +81,17 @@ def test_alignments_are_solved_again_and_compared(recording: Path, capsys: Captu
     assert not bob["frames"][0]["alignments"][0]["beyond"]
 
 
-def test_true_anchor_poses_can_be_given(recording: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_true_anchor_poses_can_be_given(recording: Path, tmp_path: Path, cli: CommandLine) -> None:
     path = tmp_path / "true.toml"
     path.write_text(Constellation("table", TRUE, {}, {"table": 0.16}).to_toml())
-    result = solve(capsys, str(recording), "--anchors", str(path))
+    result = cli.json("anchors", "solve", recording, "--anchors", path)
     assert [one["frames"][0]["outliers"] for one in result["participants"][:2]] == [[], []]
     assert result["constellation"]["moved"] == []
 
 
-def test_relative_sheet_poses_and_moved_sheet(recording: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_relative_sheet_poses_and_moved_sheet(recording: Path, tmp_path: Path, cli: CommandLine) -> None:
     out = tmp_path / "anchors.toml"
-    result = solve(capsys, str(recording), "--out", str(out))
+    result = cli.json("anchors", "solve", recording, "--out", out)
     (moved,) = result["constellation"]["moved"]
     assert moved["anchor_id"] == "shelf"
     assert moved["distance_m"] == pytest.approx(0.03, abs=0.008)
@@ -132,37 +123,36 @@ def test_moved_anchor_is_used_at_its_pose_of_the_time(tmp_path: Path) -> None:
     assert distance(after.T_world_tracking[0], (x + 0.5, y, z)) < 1e-6
 
 
-def test_unusable_observations_are_counted(tmp_path: Path, capsys: Capture) -> None:
+def test_unusable_observations_are_counted(tmp_path: Path, cli: CommandLine) -> None:
     played, T = Played({"table": TRUE["table"]}, {"table": 0.12}), frames()[0]
     played.join(1, "p1", "ann")
     played.look(1, "table", TRUE["table"], T, 1, n=6)
     played.look(1, "door", TRUE["door"], T, 2, n=5)
-    result = solve(capsys, str(played.write(tmp_path / "session.rrd")))
+    result = cli.json("anchors", "solve", str(played.write(tmp_path / "session.rrd")))
     (frame,) = result["participants"][0]["frames"]
     assert frame["refused"]
     assert "160 mm, not 120 mm" in frame["advice"]
     assert frame["unused"] == {"unknown anchor": 5, "wrong size": 6}
 
 
-def test_recordings_without_headsets_or_with_one_sheet(tmp_path: Path, capsys: Capture) -> None:
+def test_recordings_without_headsets_or_with_one_sheet(tmp_path: Path, cli: CommandLine) -> None:
     played = Played({"table": TRUE["table"]})
     empty = str(played.write(tmp_path / "empty.rrd"))
-    assert main(["anchors", "solve", empty]) == 0
-    assert "headset" in capsys.readouterr().out
-    assert main(["anchors", "solve", empty, "--out", str(tmp_path / "x.toml")]) == 1
-    assert capsys.readouterr().err.endswith(
+    assert "headset" in cli.run("anchors", "solve", empty)
+    assert cli.refuse("anchors", "solve", empty, "--out", tmp_path / "x.toml", status=1).endswith(
         "is not written: 0 sheets were seen: 2 are needed to say where they lie to each other\n"
     )
     assert not (tmp_path / "x.toml").exists()
 
 
-def test_solve_reports_unusable_files(tmp_path: Path, recording: Path, capsys: Capture) -> None:
-    assert main(["anchors", "solve", str(tmp_path / "none.rrd")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert main(["anchors", "solve", str(recording), "--anchors", str(tmp_path / "none.toml")]) == 2
-    assert "`iris-session anchors example`" in capsys.readouterr().err
-    assert main(["anchors", "solve", str(recording), "--out", str(tmp_path / "no" / "folder.toml")]) == 2
-    assert "cannot be written" in capsys.readouterr().err
+def test_solve_reports_unusable_files(tmp_path: Path, recording: Path, cli: CommandLine) -> None:
+    assert cli.refuse("anchors", "solve", tmp_path / "none.rrd").count("\n") == 1
+    assert "`iris-session anchors example`" in cli.refuse(
+        "anchors", "solve", str(recording), "--anchors", str(tmp_path / "none.toml")
+    )
+    assert "cannot be written" in cli.refuse(
+        "anchors", "solve", str(recording), "--out", str(tmp_path / "no" / "folder.toml")
+    )
 
 
 def test_solutions_of_both_sides_are_weighted_by_their_covariance() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 import sys
@@ -21,7 +20,6 @@ from anchors.pose import PoseTuple, compose, distance, inverse, quat_angle, quat
 from anchors.sheet import Sheet
 from anchors.sheet_print import to_pdf
 from iris_session import SceneBuilder, ScenePublisher, SessionConfig
-from iris_session.cli.main import main
 from iris_session.cloud.camera_file import load_camera_file
 from iris_session.demo.named_scenes import scene_by_name
 from tests.cloud.rays import cast_picture, look_at
@@ -30,24 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from render_sheet import Conditions, Page, photograph
 
-Capture = pytest.CaptureFixture[str]
-
-
-def run(capsys: Capture, *arguments: object) -> dict[str, Any]:
-    """Return the object of a command that succeeds."""
-    status = main([*map(str, arguments), "--json"])
-    out, err = capsys.readouterr()
-    assert status == 0, err
-    result: dict[str, Any] = json.loads(out)
-    return result
-
-
-def refuse(capsys: Capture, status: int, *arguments: object) -> str:
-    """Return the line of a command that fails."""
-    assert main([*map(str, arguments)]) == status
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    return err
+from tests.cli.conftest import CommandLine
 
 
 def measure_errors(found: dict[str, Any], true: PoseTuple) -> tuple[float, float]:
@@ -110,7 +91,7 @@ def _text(pose: PoseTuple) -> str:
 
 
 @pytest.mark.parametrize("on_hand", ["sheet", "camera"])
-def test_what_is_on_the_hand_is_calibrated(on_hand: str, folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_what_is_on_the_hand_is_calibrated(on_hand: str, folder: Path, tmp_path: Path, cli: CommandLine) -> None:
     if on_hand == "sheet":
         hand = [compose(compose(T_BASE_CAMERA, T), inverse(T_EE_SHEET)) for T in SEEN]
         options, names = [], ("T_base_camera", "T_ee_sheet")
@@ -118,7 +99,7 @@ def test_what_is_on_the_hand_is_calibrated(on_hand: str, folder: Path, tmp_path:
         hand = [compose(T_BASE_CAMERA, inverse(compose(T_EE_SHEET, T))) for T in SEEN]
         options, names = ["--camera-on-hand"], ("T_base_sheet", "T_ee_camera")
     poses, out = _csv(tmp_path / "poses.csv", hand), tmp_path / "camera.toml"
-    result = run(capsys, *CALIBRATE, folder, *SMALL_SHEET, "--poses", poses, *options, "--out", out)
+    result = cli.json(*CALIBRATE, folder, *SMALL_SHEET, "--poses", poses, *options, "--out", out)
     assert (result["mode"], result["used"], result["left_out"]) == (f"{on_hand}-on-hand", 5, 0)
     for name, true in zip(names, (T_BASE_CAMERA, T_EE_SHEET), strict=True):
         mm, deg = measure_errors(result[name], true)
@@ -128,32 +109,31 @@ def test_what_is_on_the_hand_is_calibrated(on_hand: str, folder: Path, tmp_path:
     assert result["residual_px_rms"] < 0.5
 
 
-def test_one_picture_is_enough_with_a_known_hand(folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_one_picture_is_enough_with_a_known_hand(folder: Path, tmp_path: Path, cli: CommandLine) -> None:
     one = tmp_path / "one"
     one.mkdir()
     shutil.copy(folder / "0000.png", one)
     poses = _csv(tmp_path / "poses.csv", [compose(compose(T_BASE_CAMERA, SEEN[0]), inverse(T_EE_SHEET))])
     options = ("--intrinsics", folder / "intrinsics.toml", "--poses", poses, "--in-hand", _text(T_EE_SHEET))
-    result = run(capsys, *CALIBRATE, one, *SMALL_SHEET, *options)
+    result = cli.json(*CALIBRATE, one, *SMALL_SHEET, *options)
     assert measure_errors(result["T_base_camera"], T_BASE_CAMERA)[0] < 3.0
 
 
-def test_cameras_that_see_a_sheet_on_the_table(folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_cameras_that_see_a_sheet_on_the_table(folder: Path, tmp_path: Path, cli: CommandLine) -> None:
     T_base_sheet: PoseTuple = ((0.0, -0.45, 0.0), quat_from_rotvec((0.0, 0.0, 0.3)))
     for number, name in enumerate(("front", "left")):
         (tmp_path / name).mkdir()
         shutil.copy(folder / f"{number:04}.png", tmp_path / name)
         (tmp_path / name / "intrinsics.toml").write_text(INTRINSICS)
     command = (*CALIBRATE, str(tmp_path), *SMALL_SHEET, "--at", f"table={_text(T_base_sheet)}")
-    result = run(capsys, *command)
+    result = cli.json(*command)
     for number, name in enumerate(("front", "left")):
         true = compose(T_base_sheet, inverse(SEEN[number]))
         assert measure_errors(result["cameras"][name]["T_base_camera"], true)[0] < 2.0
-    assert main([*command]) == 0
-    assert "T_base_camera of left" in capsys.readouterr().out
+    assert "T_base_camera of left" in cli.run(*command)
 
 
-def test_unusable_pictures_are_one_line(folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_unusable_pictures_are_one_line(folder: Path, tmp_path: Path, cli: CommandLine) -> None:
     poses, small = _csv(tmp_path / "poses.csv", SEEN[:3]), tmp_path / "small"
     small.mkdir()
     cv2.imwrite(str(small / "0000.png"), np.zeros((48, 64), np.uint8))
@@ -165,9 +145,9 @@ def test_unusable_pictures_are_one_line(folder: Path, tmp_path: Path, capsys: Ca
         ((folder, "--at", "door=0,0,0,1,0,0,0"), "add --sheet door=150mm"),
         ((small, "--poses", poses, "--intrinsics", folder / "intrinsics.toml"), "64 x 48"),
     ):
-        assert said in refuse(capsys, 2, *CALIBRATE, *words, *SMALL_SHEET)
+        assert said in cli.refuse(*CALIBRATE, *words, *SMALL_SHEET)
     (small / "0000.png").write_bytes(b"no picture")
-    assert "0000.png" in refuse(capsys, 2, *CALIBRATE, small, *SMALL_SHEET, "--poses", poses)
+    assert "0000.png" in cli.refuse(*CALIBRATE, small, *SMALL_SHEET, "--poses", poses)
 
 
 @pytest.mark.parametrize(
@@ -180,15 +160,9 @@ def test_unusable_pictures_are_one_line(folder: Path, tmp_path: Path, capsys: Ca
         (f"{HEADER}\n\na.png,0,0,0,1,0,0,0\na.png,0,0,0,1,0,0,0\n", "line 4: "),
     ],
 )
-def test_invalid_poses_are_rejected(text: str, error: str, tmp_path: Path, capsys: Capture) -> None:
+def test_invalid_poses_are_rejected(text: str, error: str, tmp_path: Path, cli: CommandLine) -> None:
     (tmp_path / "poses.csv").write_text(text)
-    assert error in refuse(capsys, 2, *CALIBRATE, tmp_path, *SMALL_SHEET, "--poses", tmp_path / "poses.csv")
-
-
-@pytest.mark.parametrize("given", ["table=0,0,0", "table=0,0,0,2,0,0,0", "0,0,0,1,0,0,0"])
-def test_pose_on_the_command_line_is_checked(given: str) -> None:
-    with pytest.raises(SystemExit):
-        main([*CALIBRATE, "pictures", *SMALL_SHEET, "--at", given])
+    assert error in cli.refuse(*CALIBRATE, tmp_path, *SMALL_SHEET, "--poses", tmp_path / "poses.csv")
 
 
 # --- cloud calibrate --------------------------------------------------------------------------------------------------
@@ -245,10 +219,10 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
     return Room(folder)
 
 
-def test_cameras_are_fitted_to_each_other_after_the_sheet(room: Room, capsys: Capture) -> None:
+def test_cameras_are_fitted_to_each_other_after_the_sheet(room: Room, cli: CommandLine) -> None:
     out = room.folder / "calibration.toml"
     file = room.write("front", "left")
-    result = run(capsys, "cloud", "calibrate", file, *SHEET, "--frames", 2, "--icp", "--out", out)
+    result = cli.json("cloud", "calibrate", file, *SHEET, "--frames", 2, "--icp", "--out", out)
     assert result["used"] == 4
     for name, pose in POSES.items():
         mm, deg = measure_errors(result["cameras"][name]["T_base_camera"], pose_from_matrix(pose))
@@ -263,34 +237,31 @@ def test_cameras_are_fitted_to_each_other_after_the_sheet(room: Room, capsys: Ca
     assert settings.cameras[0].pose is not None
 
 
-def test_a_check_tells_which_camera_is_not_where_it_was_calibrated(room: Room, capsys: Capture) -> None:
-    def check(shift_m: float) -> tuple[int, dict[str, Any]]:
+def test_a_check_tells_which_camera_is_not_where_it_was_calibrated(room: Room, cli: CommandLine) -> None:
+    def check(shift_m: float, status: int) -> dict[str, Any]:
         p, q = pose_from_matrix(POSES["front"])
         pose = f"pose = {{position_m = [{p[0] + shift_m}, {p[1]}, {p[2]}], quaternion_wxyz = {list(q)}}}\n"
         file = room.write("front", more=f"error_mm = 10.0\n{pose}")
-        command = ["cloud", "calibrate", str(file), *SHEET, "--frames", "1", "--check"]
-        status = main([*command, "--json"])
-        result: dict[str, Any] = json.loads(capsys.readouterr().out)
-        return status, result
+        return cli.json("cloud", "calibrate", file, *SHEET, "--frames", 1, "--check", status=status)
 
-    status, well = check(0.0)
-    assert (status, well["ok"], well["cameras"]["front"]["fits"]) == (0, True, True)
-    status, moved = check(0.06)
-    assert (status, moved["ok"], moved["cameras"]["front"]["fits"]) == (1, False, False)
+    well = check(0.0, status=0)
+    assert (well["ok"], well["cameras"]["front"]["fits"]) == (True, True)
+    moved = check(0.06, status=1)
+    assert (moved["ok"], moved["cameras"]["front"]["fits"]) == (False, False)
     assert moved["cameras"]["front"]["shift_mm"] == pytest.approx(60.0, abs=8.0)
     file = room.write("front", more=f"pose = {IDENTITY}\n")
-    assert "--out" in refuse(capsys, 2, "cloud", "calibrate", file, *SHEET, "--check", "--out", room.folder / "no.toml")
-    assert "calibration" in refuse(capsys, 2, "cloud", "calibrate", room.write("front"), *SHEET, "--check")
+    assert "--out" in cli.refuse("cloud", "calibrate", file, *SHEET, "--check", "--out", room.folder / "no.toml")
+    assert "calibration" in cli.refuse("cloud", "calibrate", room.write("front"), *SHEET, "--check")
 
 
-def test_frames_of_a_camera_at_rest_count_as_one(room: Room, capsys: Capture) -> None:
+def test_frames_of_a_camera_at_rest_count_as_one(room: Room, cli: CommandLine) -> None:
     """Ten pictures from one place have the errors of that place ten times."""
-    one, three = (run(capsys, "cloud", "calibrate", room.write("left"), *SHEET, "--frames", n) for n in (1, 3))
+    one, three = (cli.json("cloud", "calibrate", room.write("left"), *SHEET, "--frames", n) for n in (1, 3))
     assert three["used"] == 3
     assert three["error_mm_p95"] == pytest.approx(one["error_mm_p95"], rel=0.3)
 
 
-def test_sheets_come_from_the_session(room: Room, capsys: Capture) -> None:
+def test_sheets_come_from_the_session(room: Room, cli: CommandLine) -> None:
     scene = SceneBuilder("bench")
     scene.add_plane("floor", half_size=(2.0, 2.0))
     config = SessionConfig(
@@ -302,18 +273,18 @@ def test_sheets_come_from_the_session(room: Room, capsys: Capture) -> None:
         anchor_errors={"door": 0.5},
     )
     with ScenePublisher(scene, config) as session:
-        result = run(capsys, "cloud", "calibrate", room.write("front"), "--address", session.address, "--frames", 1)
+        result = cli.json("cloud", "calibrate", room.write("front"), "--address", session.address, "--frames", 1)
     assert measure_errors(result["T_base_camera"], pose_from_matrix(POSES["front"]))[0] < 10.0
     assert result["error_mm_p95"] < 30.0, "that of a sheet that is not seen does not count"
     assert result["sheets_without_error"] == ["table"]
 
 
-def test_unusable_input_is_a_one_line_error(room: Room, tmp_path: Path, capsys: Capture) -> None:
+def test_unusable_input_is_a_one_line_error(room: Room, tmp_path: Path, cli: CommandLine) -> None:
     file = room.write("front")
-    assert "--sheet door=150mm" in refuse(capsys, 2, "cloud", "calibrate", file, "--at", "door=0,0,0,1,0,0,0")
-    assert "one camera" in refuse(capsys, 2, "cloud", "calibrate", file, *SHEET, "--icp")
-    assert "cannot be read" in refuse(capsys, 2, "cloud", "calibrate", tmp_path / "no.toml", *SHEET)
+    assert "--sheet door=150mm" in cli.refuse("cloud", "calibrate", file, "--at", "door=0,0,0,1,0,0,0")
+    assert "one camera" in cli.refuse("cloud", "calibrate", file, *SHEET, "--icp")
+    assert "cannot be read" in cli.refuse("cloud", "calibrate", tmp_path / "no.toml", *SHEET)
     door = ("--sheet", "door=150mm", "--at", "door=0,0,0,1,0,0,0")
-    assert "no sheet was found in 1 picture:" in refuse(capsys, 1, "cloud", "calibrate", file, *door, "--frames", 1)
+    assert "no sheet was found in 1 picture:" in cli.refuse("cloud", "calibrate", file, *door, "--frames", 1, status=1)
     on_hand = room.write("front", more='body = "hand"\n')
-    assert "--camera-on-hand" in refuse(capsys, 2, "cloud", "calibrate", on_hand, *SHEET)
+    assert "--camera-on-hand" in cli.refuse("cloud", "calibrate", on_hand, *SHEET)

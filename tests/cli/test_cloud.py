@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,11 +13,11 @@ import numpy as np
 import pytest
 
 from iris_session.cli.cloud import format_faults, format_inspection, format_report
-from iris_session.cli.main import main
 from iris_session.cloud.camera_file import load_camera_file
 from iris_session.cloud.config import CameraReport, SourceReport
 from iris_session.cloud.process import OnReport
 from iris_session.protocol.names import StreamFault
+from tests.cli.conftest import CommandLine
 
 
 @pytest.fixture(autouse=True)
@@ -45,22 +44,18 @@ def camera_file(tmp_path: Path) -> Path:
     return path
 
 
-def test_an_example_is_written_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_example_is_written_once(tmp_path: Path, cli: CommandLine) -> None:
     path = tmp_path / "camera.toml"
-    assert main(["cloud", "example", "--source", "mujoco", "-o", str(path)]) == 0
+    cli.run("cloud", "example", "--source", "mujoco", "-o", path)
     assert load_camera_file(path).cameras[0].source == "mujoco"
-    assert "cloud inspect" in capsys.readouterr().out
-    assert main(["cloud", "example", "-o", str(path)]) == 2
-    assert "exists" in capsys.readouterr().err
-    assert main(["cloud", "example", "-o", str(tmp_path / "no" / "camera.toml")]) == 2
-    assert "cannot be written" in capsys.readouterr().err
-    assert main(["cloud", "example"]) == 0
-    assert 'source = "folder"' in capsys.readouterr().out
+    assert "cloud inspect" in cli.out
+    assert "exists" in cli.refuse("cloud", "example", "-o", path)
+    assert "cannot be written" in cli.refuse("cloud", "example", "-o", tmp_path / "no" / "camera.toml")
+    assert 'source = "folder"' in cli.run("cloud", "example")
 
 
-def test_a_file_is_inspected(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["cloud", "inspect", str(camera_file), "--seconds", "1", "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+def test_a_file_is_inspected(camera_file: Path, cli: CommandLine) -> None:
+    report = cli.json("cloud", "inspect", camera_file, "--seconds", "1")
     assert report["ok"]
     assert report["hz"] > 0.0
     assert report["points"] > 100
@@ -73,26 +68,23 @@ def test_a_file_is_inspected(camera_file: Path, capsys: pytest.CaptureFixture[st
     assert all(f"{stage} " in text for stage in report["stages_ms"])
 
 
-def test_a_fault_is_shown_and_is_the_exit_status(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fault_is_shown_and_is_the_exit_status(camera_file: Path, cli: CommandLine) -> None:
     for path in camera_file.parent.glob("*.depth.png"):
         cv2.imwrite(str(path), np.zeros((60, 80), np.uint16))
-    assert main(["cloud", "inspect", str(camera_file), "--seconds", "1"]) == 1
-    text = capsys.readouterr().out
+    text = cli.run("cloud", "inspect", camera_file, "--seconds", "1", status=1)
     assert "no_depth: no pixel has a depth" in text
     assert "cloud room: no points came" in text
 
 
-def test_a_picture_that_cannot_be_read_is_one_line(camera_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_picture_that_cannot_be_read_is_one_line(camera_file: Path, cli: CommandLine) -> None:
     (camera_file.parent / "0.depth.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(4) + b"IHDR" + b"\xff" * 9)
-    assert main(["cloud", "calibrate", str(camera_file), "--sheet", "a=100mm", "--at", "a=0,0,0,1,0,0,0"]) == 2
-    error = capsys.readouterr().err
+    error = cli.refuse("cloud", "calibrate", camera_file, "--sheet", "a=100mm", "--at", "a=0,0,0,1,0,0,0")
     assert "camera 'front'" in error
     assert "0.depth.png" in error
-    assert error.count("\n") == 1
 
 
 def test_cameras_that_no_session_admitted_are_a_fault(
-    camera_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    camera_file: Path, cli: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     connected = False
     now_s = 100.0
@@ -112,20 +104,17 @@ def test_cameras_that_no_session_admitted_are_a_fault(
     monkeypatch.setattr("iris_session.cli.common.check_session_reachable", lambda _: None)
     monkeypatch.setattr("iris_session.cli.cloud.time", SimpleNamespace(monotonic=lambda: now_s))
     command = ["cloud", "run", str(camera_file), "--address", "127.0.0.1:1", "--seconds", "0.1"]
-    assert main(command) == 1
-    assert "no session admitted the cameras within 0.1 s: 127.0.0.1:1" in capsys.readouterr().err
+    cli.run(*command, status=1)
+    assert "no session admitted the cameras within 0.1 s: 127.0.0.1:1" in cli.err
     connected = True
-    assert main(command) == 0
+    cli.run(*command)
 
 
-def test_a_camera_on_a_body_cannot_be_inspected_without_a_session(
-    camera_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_camera_on_a_body_cannot_be_inspected_without_a_session(camera_file: Path, cli: CommandLine) -> None:
     camera_file.write_text(camera_file.read_text() + 'body = "left/hand"\n')
-    assert main(["cloud", "inspect", str(camera_file)]) == 2
-    error = capsys.readouterr().err
-    assert "camera 'front' is on body 'left/hand': only a session knows where that is" in error
-    assert error.count("\n") == 1
+    assert "camera 'front' is on body 'left/hand': only a session knows where that is" in cli.refuse(
+        "cloud", "inspect", camera_file
+    )
 
 
 def test_a_report_is_one_line() -> None:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from iris_session.cli import policy
 from iris_session.cli.common import CommandError
-from iris_session.cli.main import main
 from iris_session.cli.policy import LeRobotPolicy, RunLog, check_fit, drive, make_blank, name_inputs
 
 CAMERA = gymnasium.spaces.Box(0, 255, (8, 16, 3), np.uint8)
@@ -187,13 +186,6 @@ def test_without_lerobot_one_line_says_how(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(CommandError, match="pip install lerobot"):
         LeRobotPolicy("me/act")
-
-
-def test_no_session_is_said_before_a_policy_is_loaded(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["policy", "--repo", "x", "--robot", "left", "--address", "127.0.0.1:1"]) == 2
-    assert "no session answers at 127.0.0.1:1" in capsys.readouterr().err
-    assert main(["policy", "--repo", "x", "--robot", "left", "--hz", "0"]) == 2
-    assert "1 to 240" in capsys.readouterr().err
 
 
 @pytest.mark.long

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from pathlib import Path
@@ -11,11 +10,11 @@ from typing import Any
 import msgspec
 import pytest
 
+from iris_session.cli.common import MOST_LINES
 from iris_session.cli.main import INTERRUPTED, main
-from iris_session.cli.recording import MOST_LINES, format_line, format_summary
+from iris_session.cli.recording import format_line, format_summary
 from iris_session.protocol.server_messages import EpisodeChanged, Event
-from iris_session.recording import Recording, parts
-from iris_session.recording.folders import find_recordings
+from iris_session.recording import parts
 from iris_session.recording.summary import (
     AlignmentSummary,
     DropSummary,
@@ -28,6 +27,7 @@ from iris_session.recording.summary import (
 )
 from iris_session.recording.writer import RrdWriter
 from iris_session.rrd.assets import AssetsSummary
+from tests.cli.conftest import CommandLine
 from tests.recording.support import TICK_NS, journal, write
 from tests.recording.test_summary import write_session
 
@@ -100,21 +100,19 @@ def test_a_summary_is_lines_for_people() -> None:
     )
 
 
-def test_inspect_shows_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_shows_a_recording(tmp_path: Path, cli: CommandLine) -> None:
     path = write_session(tmp_path / "session.rrd")
-    assert main(["recording", "inspect", str(path)]) == 0
-    out, err = capsys.readouterr()
-    assert err == ""
+    out = cli.run("recording", "inspect", path)
+    assert cli.err == ""
     assert "ann (operator, head, hand/left): 0.4 s, there at the end; held left for 0.4 s" in out
     assert "  damage     none" in out
     assert "  assets     none: made by an earlier version, or the session shared no scene" in out
-    assert main(["recording", "inspect", str(path), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = cli.json("recording", "inspect", path)
     assert sorted(result) == sorted(RecordingSummary.__struct_fields__)
     assert (result["ok"], result["steps"], result["people"][0]["held_s"]) == (True, 200, {"left": 0.358})
 
 
-def test_episodes_of_a_recording_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_episodes_of_a_recording_are_listed(tmp_path: Path, cli: CommandLine) -> None:
     header, batch = journal(20)
     running, over = (EpisodeChanged(1, state, "pour", "p1") for state in ("running", "success"))
     batch.events = [Event(1, 5, 6 * TICK_NS, running), Event(2, 15, 16 * TICK_NS, over)]
@@ -123,41 +121,22 @@ def test_episodes_of_a_recording_are_listed(tmp_path: Path, capsys: pytest.Captu
     writer.write_header(header)
     writer.add(batch)
     writer.close()
-    assert main(["recording", "episodes", str(path), "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
-    assert main(["recording", "inspect", str(path), "--json"]) == 0
-    (inspected,) = json.loads(capsys.readouterr().out)["episodes"]
+    shown = cli.json("recording", "episodes", path)
+    (inspected,) = cli.json("recording", "inspect", path)["episodes"]
     assert shown["episodes"][0].items() >= inspected.items()
     assert [one["verdict"] for one in shown["episodes"]] == ["success"]
-    with Recording.open(path) as recording:
-        (episode,) = recording.episodes
-    assert (episode.label, episode.text, episode.start_ns) == ("success", "pour", 6 * TICK_NS)
-    batch.events = [Event(1, 5, 6 * TICK_NS, running)]
-    path = tmp_path / "cut.rrd"
-    writer = RrdWriter(path, "id")
-    writer.write_header(header)
-    writer.add(batch)
-    writer.close()
-    with Recording.open(path) as recording:
-        (episode,) = recording.episodes
-    assert (episode.label, episode.ended, episode.end_ns) == ("unknown", False, 20 * TICK_NS)
 
 
-def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_is_a_line_for_every_recording(tmp_path: Path, cli: CommandLine) -> None:
     for name in ("a/session.rrd", "b/session.part2.rrd", "b/session.part3.rrd", "b/session.resume2.rrd"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"no recording")
     (tmp_path / "notes.txt").write_text("none either")
-    names = [path.relative_to(tmp_path).as_posix() for path in find_recordings(tmp_path, pytest.fail)]
-    assert names == ["a/session.rrd", "b/session.resume2.rrd", "b/session.part2.rrd"]
     write(tmp_path / "a/session.rrd", *journal(20))
-    assert main(["recording", "inspect", str(tmp_path)]) == 1
-    out, err = capsys.readouterr()
-    assert out.startswith(f"{tmp_path}/a/session.rrd  ")
-    assert out.count("\n") == 1
-    assert err.count("iris-session: ") == err.count("\n") == 2
-    assert main(["recording", "inspect", str(tmp_path), "--json"]) == 1
-    result = json.loads(capsys.readouterr().out)
+    (line,) = cli.run("recording", "inspect", tmp_path, status=1).splitlines()
+    assert line.startswith(f"{tmp_path}/a/session.rrd  ")
+    assert cli.err.count("iris-session: ") == cli.err.count("\n") == 2
+    result = cli.json("recording", "inspect", tmp_path, status=1)
     assert [row["ok"] for row in result["recordings"]] == [True, False, False]
     assert "not a Rerun file" in result["recordings"][1]["error"]
 
@@ -207,8 +186,7 @@ def test_text_of_a_file_controls_no_terminal(tmp_path: Path, capsys: pytest.Capt
     assert "\x1b" not in out + err
 
 
-def test_a_folder_without_recordings_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["recording", "inspect", str(tmp_path)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"iris-session: there is no recording below the folder {tmp_path}: give a .rrd file")
-    assert main(["recording", "inspect", "x" * 5000]) == 2
+def test_what_is_no_recording_is_one_line(tmp_path: Path, cli: CommandLine) -> None:
+    text = f"iris-session: there is no recording below the folder {tmp_path}: give one with .rrd files"
+    assert cli.refuse("recording", "inspect", tmp_path).startswith(text)
+    assert "does not exist" in cli.refuse("recording", "inspect", "x" * 5000)

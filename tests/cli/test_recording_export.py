@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from iris_session.cli.main import main
 from iris_session.protocol.scene import decode_scene
 from iris_session.rrd.assets import list_recorded_assets
 from iris_session.scene import AssetStore
+from tests.cli.conftest import CommandLine
 from tests.recording.test_recorded_assets import Shared, record
 from tests.replay.support import Played, play
 
@@ -23,20 +23,17 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
     return made
 
 
-def test_a_line_for_each_table(played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_line_for_each_table(played: Played, tmp_path: Path, cli: CommandLine) -> None:
     out = tmp_path / "tables"
     command = ["recording", "export", str(played.path.parent), "--to", "csv", "-o", str(out)]
-    assert main([*command, "--hz", "50", "--robot", "left", "--table", "robots", "--table", "events"]) == 0
-    shown = capsys.readouterr()
-    assert shown.err == ""
-    lines = shown.out.splitlines()
+    cli.run(*command, "--hz", "50", "--robot", "left", "--table", "robots", "--table", "events")
+    assert cli.err == ""
+    lines = cli.out.splitlines()
     assert lines[0] == f"{out}/robot-left.csv: 6 rows, 28 columns"
     assert lines[1].startswith(f"{out}/events.csv: ")
     assert sorted(os.listdir(out)) == ["events.csv", "robot-left.csv"]
-    assert main(command) == 2
-    assert capsys.readouterr().err == f"iris-session: the folder {out} is not empty: give another one, or --force\n"
-    assert main([*command, "--force", "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    assert cli.refuse(*command) == f"iris-session: the folder {out} is not empty: give another one, or --force\n"
+    report = cli.json(*command, "--force")
     assert report["folder"] == str(out)
     assert report["left_out"] == report["damage"] == []
     assert report["tables"][0] == {
@@ -48,23 +45,21 @@ def test_a_line_for_each_table(played: Played, tmp_path: Path, capsys: pytest.Ca
     }
 
 
-def test_damage_is_said_and_is_a_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damage_is_said_and_is_a_status(tmp_path: Path, cli: CommandLine) -> None:
     gap = play(tmp_path / "session.rrd", 45)
     del gap.batch.rows[30]
     path = gap.write()
-    assert main(["recording", "export", str(path), "--to", "npz", "-o", str(tmp_path / "tables")]) == 1
-    shown = capsys.readouterr()
-    assert shown.err == f"iris-session: {path} is damaged: steps 30 to 39 are left out\n"
-    assert f"{tmp_path / 'tables'}/events.npz" in shown.out
+    cli.run("recording", "export", path, "--to", "npz", "-o", tmp_path / "tables", status=1)
+    assert cli.err == f"iris-session: {path} is damaged: steps 30 to 39 are left out\n"
+    assert f"{tmp_path / 'tables'}/events.npz" in cli.out
 
 
-def test_assets_are_files_by_hash(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_assets_are_files_by_hash(tmp_path: Path, cli: CommandLine) -> None:
     shared = Shared(tmp_path / "store")
     path = record(tmp_path / "session.rrd", shared)
     out = tmp_path / "scene-files"
     command = ["recording", "export", str(path), "--to", "assets", "-o", str(out)]
-    assert main([*command, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    report = cli.json(*command)
     wanted = {shared.scene_hash, *list_recorded_assets(shared.spec, "scene")}
     assert (report["scenes"], report["assets"], report["damage"]) == (1, len(wanted), [])
     (scene,) = json.loads((out / "scenes.json").read_text())["scenes"]
@@ -72,12 +67,12 @@ def test_assets_are_files_by_hash(tmp_path: Path, capsys: pytest.CaptureFixture[
     copied = AssetStore(out)
     assert decode_scene(copied.get(scene["hash"])) == shared.spec
     assert {address: copied.get(address) for address in wanted} == {a: shared.store.get(a) for a in wanted}
-    assert main(command) == 2
-    assert capsys.readouterr().err == f"iris-session: the folder {out} is not empty: give another one, or --force\n"
+    assert cli.refuse(*command) == f"iris-session: the folder {out} is not empty: give another one, or --force\n"
     damaged = AssetStore(out).path(scene["hash"])
     damaged.write_bytes(bytes(damaged.stat().st_size))
-    assert main([*command, "--force"]) == 0
+    cli.run(*command, "--force")
     assert AssetStore(out).get(scene["hash"]) == shared.store.get(scene["hash"]), "files that are there are replaced"
-    assert capsys.readouterr().out == f"{out}: {len(wanted)} assets, {report['bytes'] / 1e6:.1f} MB, scenes: 1\n"
-    assert main([*command, "--force", "--robot", "left"]) == 2
-    assert "--robot choose tables: leave them out with --to assets" in capsys.readouterr().err
+    assert cli.out == f"{out}: {len(wanted)} assets, {report['bytes'] / 1e6:.1f} MB, scenes: 1\n"
+    assert "--robot choose tables: leave them out with --to assets" in cli.refuse(
+        *command, "--force", "--robot", "left"
+    )

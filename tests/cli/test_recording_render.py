@@ -14,9 +14,9 @@ import pytest
 from PIL import Image as Pillow
 from PIL import ImageSequence
 
-from iris_session.cli.main import main
 from iris_session.recording import Recording
 from iris_session.replay.pictures import Image, PictureOptions, RecordingPictures, Timeline
+from tests.cli.conftest import CommandLine
 from tests.replay.support import Played, make_drawn_core, play, step_ns
 
 SIZE = ("--size", "160x120")
@@ -29,8 +29,9 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
     return made
 
 
-def render(path: Path, out: Path, *options: str) -> int:
-    return main(["recording", "render", str(path), "-o", str(out), *SIZE, *options])
+def render(path: Path, out: Path, *options: str) -> tuple[object, ...]:
+    """Return the words of the command."""
+    return "recording", "render", path, "-o", out, *SIZE, *options
 
 
 def draw(played: Played, times_ns: Sequence[int], camera: str = "operator") -> list[Image]:
@@ -41,16 +42,13 @@ def draw(played: Played, times_ns: Sequence[int], camera: str = "operator") -> l
         return list(made.draw(times_ns))
 
 
-def test_a_video_holds_the_pictures_in_order(
-    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_video_holds_the_pictures_in_order(played: Played, tmp_path: Path, cli: CommandLine) -> None:
     out = tmp_path / "session.mp4"
-    assert render(played.path, out, "--camera", "operator", "--fps", "100", "--json") == 0
-    shown = capsys.readouterr()
-    assert shown.err == ""
+    cli.run(*render(played.path, out, "--camera", "operator", "--fps", "100", "--json"))
+    assert cli.err == ""
     begin_ns, end_ns = step_ns(0), step_ns(59)
     times = range(begin_ns, end_ns + 1, 10_000_000)
-    assert json.loads(shown.out) == {
+    assert json.loads(cli.out) == {
         "file": str(out),
         "pictures": len(times),
         "begin_s": times[0] * 1e-9,
@@ -73,22 +71,20 @@ def test_a_video_holds_the_pictures_in_order(
     assert os.listdir(tmp_path) == ["session.mp4"]
 
 
-def test_a_picture_is_exactly_what_was_drawn(
-    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_picture_is_exactly_what_was_drawn(played: Played, tmp_path: Path, cli: CommandLine) -> None:
     out = tmp_path / "one.png"
-    assert render(played.path.parent, out, "--at", "0.1s", "--camera", "side") == 0
-    assert capsys.readouterr().out.startswith(f"{out}: the picture of 0.10 s, 160 x 120, PNG, ")
+    cli.run(*render(played.path.parent, out, "--at", "0.1s", "--camera", "side"))
+    assert cli.out.startswith(f"{out}: the picture of 0.10 s, 160 x 120, PNG, ")
     (drawn,) = draw(played, [100_000_000], "side")
     assert cv2.imread(str(out))[..., ::-1].tobytes() == drawn.tobytes()
-    assert render(played.path, out) == 2
-    assert capsys.readouterr().err == f"iris-session: {out} exists: give another file, or --force\n"
-    assert render(played.path, out, "--force") == 0
+    cli.run(*render(played.path, out), status=2)
+    assert cli.err == f"iris-session: {out} exists: give another file, or --force\n"
+    cli.run(*render(played.path, out, "--force"))
 
 
-def test_an_animation_has_its_times(played: Played, tmp_path: Path) -> None:
+def test_an_animation_has_its_times(played: Played, tmp_path: Path, cli: CommandLine) -> None:
     out = tmp_path / "session.gif"
-    assert render(played.path, out, "--from", "0", "--to", "0.1", "--fps", "10", "--speed", "0.2") == 0
+    cli.run(*render(played.path, out, "--from", "0", "--to", "0.1", "--fps", "10", "--speed", "0.2"))
     with Pillow.open(out) as animation:
         durations = [frame.info["duration"] for frame in ImageSequence.Iterator(animation)]  # of equal ones the sum
         assert len(durations) >= 2
@@ -96,11 +92,9 @@ def test_an_animation_has_its_times(played: Played, tmp_path: Path) -> None:
         assert animation.info["loop"] == 0
 
 
-def test_cameras_are_listed(played: Played, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["recording", "render", str(played.path), "--list-cameras"]) == 0
-    assert capsys.readouterr().out == "operator\nside\n"
-    assert main(["recording", "render", str(played.path), "--list-cameras", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"cameras": ["operator", "side"]}
+def test_cameras_are_listed(played: Played, cli: CommandLine) -> None:
+    assert cli.run("recording", "render", played.path, "--list-cameras") == "operator\nside\n"
+    assert cli.json("recording", "render", played.path, "--list-cameras") == {"cameras": ["operator", "side"]}
 
 
 @pytest.mark.parametrize(
@@ -121,27 +115,24 @@ def test_cameras_are_listed(played: Played, capsys: pytest.CaptureFixture[str]) 
     ],
 )
 def test_what_cannot_be_drawn_is_one_line(
-    played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str, options: Sequence[str], line: str
+    played: Played, tmp_path: Path, cli: CommandLine, out: str, options: Sequence[str], line: str
 ) -> None:
-    assert render(played.path, tmp_path / out, *options) == 2
-    err = capsys.readouterr().err
-    assert err.endswith(f"{line}\n")
-    assert err.count("\n") == 1
+    assert cli.refuse(*render(played.path, tmp_path / out, *options)).endswith(f"{line}\n")
     assert not os.listdir(tmp_path)
 
 
-def test_damage_is_said_and_is_a_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damage_is_said_and_is_a_status(tmp_path: Path, cli: CommandLine) -> None:
     gap = play(tmp_path / "session.rrd", 45, core=make_drawn_core())
     del gap.batch.rows[30]
     path = gap.write()
-    assert render(path, tmp_path / "x.mp4", "--fps", "100") == 1
-    assert capsys.readouterr().err == f"iris-session: {path} is damaged: steps 30 to 39 are left out\n"
+    cli.run(*render(path, tmp_path / "x.mp4", "--fps", "100"), status=1)
+    assert cli.err == f"iris-session: {path} is damaged: steps 30 to 39 are left out\n"
     assert (tmp_path / "x.mp4").stat().st_size > 0
 
 
 @pytest.mark.parametrize("kind", [".mp4", ".gif"])
 def test_ctrl_c_leaves_the_old_file_and_nothing_else(
-    kind: str, played: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, played: Played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: CommandLine
 ) -> None:
     out = tmp_path / f"x{kind}"
     out.write_text("old")
@@ -153,7 +144,7 @@ def test_ctrl_c_leaves_the_old_file_and_nothing_else(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(RecordingPictures, "draw", interrupt)
-    assert render(played.path, out, "--force", "--fps", "100") == 130
+    cli.run(*render(played.path, out, "--force", "--fps", "100"), status=130)
     assert len(inside[0]) == 2, "it is written beside the old one"
     assert os.listdir(tmp_path) == [out.name]
     assert out.read_text() == "old"

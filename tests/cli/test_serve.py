@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
 from iris_session.cli import serve
-from iris_session.cli.main import build_parser, main
+from iris_session.cli.main import build_parser
 from iris_session.cli.scene import find_scene_file
 from iris_session.protocol.errors import IrisError
 from iris_session.session.config import DEFAULT_SHEET_M, SessionConfig
+from tests.cli.conftest import CommandLine
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 ARM = '<robot name="arm"><link name="base"><visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>'
@@ -67,59 +67,46 @@ def test_unusable_files_are_reported_with_candidates(tmp_path: Path, part: Path,
     assert part.is_file()
 
 
-def test_file_is_shown_until_the_end(part: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["serve", str(part), "--scale", "0.5", "--seconds", "0.1", "--json", *QUIET]) == 0
-    out, errors = capfd.readouterr()
-    assert json.loads(out)["ok"]
-    assert "session 'Part-no.-1' on 127.0.0.1:" in errors
-    assert "extent is 0.5 x 0.5 x 0 m" in errors
-    assert "to drive it" not in errors
+def test_file_is_shown_until_the_end(part: Path, cli: CommandLine) -> None:
+    assert cli.json("serve", part, "--scale", "0.5", "--seconds", "0.1", *QUIET)["ok"]
+    assert "session 'Part-no.-1' on 127.0.0.1:" in cli.err
+    assert "extent is 0.5 x 0.5 x 0 m" in cli.err
+    assert "to drive it" not in cli.err
 
 
-def test_a_urdf_that_is_shown_says_how_it_gets_a_robot(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_urdf_that_is_shown_says_how_it_gets_a_robot(tmp_path: Path, cli: CommandLine) -> None:
     arm = tmp_path / "arm.urdf"
     box = '<visual><geometry><box size="0.1 0.1 0.4"/></geometry></visual>'
     arm.write_text(f'<robot name="arm"><link name="base">{box}</link></robot>')
-    assert main(["serve", str(arm), "--seconds", "0.1", "--json", *QUIET]) == 0
-    assert "to drive it: mujoco.MjSpec.from_file, spec.add_actuator for each joint" in capfd.readouterr().err
+    cli.json("serve", arm, "--seconds", "0.1", *QUIET)
+    assert "to drive it: mujoco.MjSpec.from_file, spec.add_actuator for each joint" in cli.err
 
 
 @pytest.mark.parametrize("given", ["0", "nan", "small"])
-def test_invalid_scale_is_rejected(given: str, part: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as raised:
-        main(["serve", str(part), f"--scale={given}", *QUIET])
-    assert raised.value.code == 2
-    assert f"{given!r} is" in capsys.readouterr().err
+def test_invalid_scale_is_rejected(given: str, part: Path, cli: CommandLine) -> None:
+    assert f"{given!r} is" in cli.refuse("serve", part, f"--scale={given}", *QUIET)
 
 
 @pytest.mark.parametrize(
     "option",
     [("--robots", "robots.toml"), ("--assign", "ann=left"), ("--mode", "request")],
 )
-def test_robot_options_are_rejected_for_shown_files(
-    option: tuple[str, str], part: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["serve", str(part), *option, *QUIET]) == 2
-    error = capsys.readouterr().err
-    assert f"{option[0]}: {part.name} has no robots" in error
-    assert error.count("\n") == 1
+def test_robot_options_are_rejected_for_shown_files(option: tuple[str, str], part: Path, cli: CommandLine) -> None:
+    assert f"{option[0]}: {part.name} has no robots" in cli.refuse("serve", part, *option, *QUIET)
 
 
-def test_package_dir_is_used(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_package_dir_is_used(tmp_path: Path, cli: CommandLine) -> None:
     arm = tmp_path / "arm" / "arm.urdf"
     for path in (arm.parent, tmp_path / "models" / "part"):
         path.mkdir(parents=True)
     (tmp_path / "models" / "part" / "a.off").write_text(TRIANGLE)
     arm.write_text(ARM.replace('<sphere radius="0.1"/>', '<mesh filename="package://part/a.off"/>'))
-    assert main(["serve", str(arm), *QUIET]) == 2
-    assert "(here: --package-dir DIR)" in capfd.readouterr().err
-    named = ("--package-dir", str(tmp_path / "models"))
-    assert main(["serve", str(arm), *named, "--seconds", "0.1", "--json", *QUIET]) == 0
-    capfd.readouterr()
-    assert main(["serve", "handover", *named, *QUIET]) == 2
-    assert "--package-dir" in capfd.readouterr().err
-    assert main(["serve", str(arm), "--package-dir", str(tmp_path / "nodir"), *QUIET]) == 2
-    assert capfd.readouterr().err == f"iris-session: --package-dir {tmp_path / 'nodir'}: no such folder\n"
+    assert "(here: --package-dir DIR)" in cli.refuse("serve", arm, *QUIET)
+    named = ("--package-dir", tmp_path / "models")
+    cli.json("serve", arm, *named, "--seconds", "0.1", *QUIET)
+    assert "--package-dir" in cli.refuse("serve", "handover", *named, *QUIET)
+    missing = tmp_path / "nodir"
+    assert f"--package-dir {missing}: no such folder\n" in cli.refuse("serve", arm, "--package-dir", missing, *QUIET)
 
 
 DOOR = (
@@ -139,10 +126,9 @@ def test_file_replaces_the_anchors_of_the_scene(tmp_path: Path) -> None:
     assert set(plain.anchors) == {"table"}
 
 
-def test_example_file_is_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_example_file_is_valid(tmp_path: Path, cli: CommandLine) -> None:
     for words in ([], ["arms4"]):
-        assert main(["anchors", "example", *words]) == 0
-        text = capsys.readouterr().out
+        text = cli.run("anchors", "example", *words)
         path = tmp_path / "example.toml"
         path.write_text(text)
         arguments = build_parser().parse_args(["serve", "arms4", "--no-record", "--anchors", str(path)])
@@ -151,8 +137,7 @@ def test_example_file_is_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert config.sheet_sizes() == {"table": DEFAULT_SHEET_M}
     own = serve.create_session(build_parser().parse_args(["serve", "arms4", "--no-record"])).config
     assert config.anchors == own.anchors, "that of the scene"
-    assert main(["anchors", "example", "arms4", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"toml": text}
+    assert cli.json("anchors", "example", "arms4") == {"toml": text}
 
 
 def test_resumed_session_gets_new_anchors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,6 @@ import msgspec
 import pytest
 
 from iris_session.cli.common import print_result
-from iris_session.cli.main import main
 from iris_session.cli.metrics import format_metrics
 from iris_session.cli.status import format_status
 from iris_session.protocol.media import StreamBudget
@@ -25,6 +24,7 @@ from iris_session.protocol.status import (
     StatusReport,
     StopReport,
 )
+from tests.cli.conftest import CommandLine
 
 ANN = ParticipantReport(
     "p1",
@@ -160,8 +160,5 @@ def test_metrics_are_well_formed() -> None:
     assert not any("state_age" in line or "missed" in line for line in lines_of_bob), "not measured"
 
 
-def test_invalid_address(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "nowhere:port"]) == 1
-    assert "is not HOST:PORT" in capsys.readouterr().out
-    assert main(["status", "nowhere:port"]) == 2
-    assert "is not HOST:PORT" in capsys.readouterr().err
+def test_doctor_takes_an_address_as_a_check(cli: CommandLine) -> None:
+    assert "is not HOST:PORT" in cli.run("doctor", "nowhere:port", status=1)
