@@ -191,6 +191,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise CommandError(str(error), 1) from error
     stolen_after_s, all_after_s = read_stolen_time()
     share = (stolen_after_s - stolen_s) / max(all_after_s - all_s, 1e-9)
-    report = report.complete(arguments.bench, options, share, min(speed, measure_parallel_speed()))
+    report = report.complete(arguments.action, options, share, min(speed, measure_parallel_speed()))
     print_result(arguments, report.as_dict(), report.format().split("\n"))
     return 0 if report.ok or not arguments.check else 1

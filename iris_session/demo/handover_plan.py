@@ -30,7 +30,14 @@ from anchors.pose import (
     quat_mul,
     quat_rotate,
 )
-from iris_session.demo.planning_scene import Floats, PlanningScene, make_state
+from iris_session.demo.planning_scene import (
+    ARRIVED_M,
+    ARRIVED_RAD,
+    Floats,
+    PlanningScene,
+    compute_error,
+    make_state,
+)
 from iris_session.emulator.behaviours.objects import raise_pose
 from iris_session.emulator.behaviours.plan import ArmPlan, HandoverPlan
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
@@ -43,6 +50,8 @@ LIFT_M: Final = 0.10
 FROM_ABOVE: Final = -0.9
 #: A gripper is opened wider than what it takes by this [m].
 SPARE_M: Final = 0.008
+#: Nearer to a grasp than this, an error says what turn is missing [m].
+NEAR_M: Final = 0.05
 #: How deep a grip is below the face from which an object is approached, at most [m].
 DEPTH_M: Final = 0.020
 #: Fingers that would stand on the table take it higher by this [m].
@@ -120,7 +129,7 @@ def plan_handover(
         try:
             return _Planner(scene, thing, give, take).plan()
         except ConfigError as error:
-            reasons.append(str(error))
+            reasons += str(error).split("; ")
     raise ConfigError(f"{thing.name} cannot be handed over: {'; '.join(dict.fromkeys(reasons))}")
 
 
@@ -189,12 +198,27 @@ class _Planner:
                 offers[key] = self._follow_offer(meeting)
             offer = offers[key]
             if offer is not None and self._check_exchange(meeting, offer):
+                for name, q in ((give, meeting.given.q), (give, q_give), (take, q_take)):
+                    if weak := scene.find_weak_motor(name, q):
+                        raise ConfigError(weak)
                 return self._make_plan(meeting)
         clash = f", or come too close ({self._clash})" if self._clash else ""
         apart = distance(self._giver.T_world_root[0], self._receiver.T_world_root[0])
+        causes = "".join(self._explain(name) for name in self._names)
         raise ConfigError(
-            f"'{self._names[0]}' and '{self._names[1]}', {apart:.2f} m apart, find no place where both reach it{clash}"
+            f"'{give}' and '{take}', {apart:.2f} m apart, find no place where both reach it{clash}{causes}"
         )
+
+    def _explain(self, name: str, goal: PoseTuple | None = None) -> str:
+        """Return what keeps an arm from a goal, or from a place of the meeting: its start, or too few joints."""
+        arm, n = self._scene.arms[name], len(self._scene.arms[name].rest)
+        is_singular = arm.is_singular()
+        if arm.can_reach(goal) if goal is not None else n >= 6 and is_singular:
+            start = (
+                "begins straight or with aligned axes (singular)" if is_singular else "gets there in another posture"
+            )
+            return f"; '{name}' {start}: a keyframe 'home' with bent joints and its gripper down may help"
+        return f"; '{name}' has {n} joints, to turn a gripper every way takes 6" if n < 6 else ""
 
     # --- the first grasp ----------------------------------------------------------------------------------------------
 
@@ -213,7 +237,8 @@ class _Planner:
             return quat_angle(compose(at, self._to_tip(name, grasp))[1], turn) + 4.0 * (1.0 + rise(grasp))
 
         found = []
-        nearest = math.inf
+        ends: list[tuple[PoseTuple, PoseTuple]] = []  # of ways to grasps from above: where they end, and should
+        clashes: dict[bool, str] = {}  # by whether it is from above
         for grasp in sorted(grasps, key=cost):
             T_grasp = compose(at, self._to_tip(name, grasp))
             ways = []
@@ -224,18 +249,30 @@ class _Planner:
                 q = way[-1]
                 if missing:
                     break
+            from_above = rise(grasp) < FROM_ABOVE
             if missing:
-                nearest = min(nearest, missing if rise(grasp) < FROM_ABOVE else math.inf)
+                ends += [(arm.find_tip(q), goal)] if from_above else []
             elif self._is_free(name, ways, at, grasp):
                 found.append(GivenGrasp(grasp, q))
                 if len(found) == MAX_GRASPS:
                     break
+            else:
+                clashes[from_above] = self._clash
+        self._clash = ""
         if found:
             return found
-        why = [f"{1e3 * nearest:.0f} mm are missing from above"] if nearest < math.inf else []
-        why += [f"{self._clash} come too close"] if self._clash else []
+        why, cause = [], ""
+        if ends:
+            tip, goal = min(ends, key=lambda end: compute_error(*end))
+            away, off = distance(tip[0], goal[0]), quat_angle(tip[1], goal[1])
+            missed = [f"{1e3 * away:.0f} mm"] if away > ARRIVED_M else []
+            missed += [f"{math.degrees(off):.0f} degrees of turn"] if off > ARRIVED_RAD and away < NEAR_M else []
+            why, cause = [f"{' and '.join(missed)} are missing from above"], self._explain(name, goal)
+        why += [
+            f"{clash} come too close {'' if above else 'from the side'}".strip() for above, clash in clashes.items()
+        ]
         raise ConfigError(
-            f"'{name}' does not reach it where it lies: {', or '.join(why) or 'it cannot be taken from above'}"
+            f"'{name}' does not reach it where it lies: {', '.join(why) or 'it cannot be taken from above'}{cause}"
         )
 
     def _is_free(self, name: str, ways: Sequence[Sequence[Floats]], at: PoseTuple, grasp: ObjectGrasp) -> bool:

@@ -24,6 +24,7 @@ from iris_session.control.solvers import make_solver
 from iris_session.emulator.behaviours.hand import TURN, HandMovement
 from iris_session.emulator.behaviours.planned import PLANNED_ARM
 from iris_session.physics import World
+from iris_session.physics.names import find_element_id, list_body_names
 from iris_session.physics.tip import Tip
 from iris_session.physics.tree import KinematicTree
 from iris_session.protocol.common import Vec3
@@ -47,6 +48,10 @@ ARRIVED_M, ARRIVED_RAD = 0.002, 0.02
 TRIES: Final = 20
 DAMPING: Final = 1e-3
 MAX_STEP: Final = 0.5
+#: Postures from which that check is made where the one at the start fails.
+POSTURES: Final = 24
+#: An arm whose tip moves less than this for a unit of joint movement, in some direction, is singular [m, rad].
+SINGULAR: Final = 0.01
 #: Least distances [m]: between robots beside their fingers, which control keeps apart; of robots from themselves, from
 #: fingers of others, from what stands around, and from an object that they approach.
 APART_M, SELF_M, FINGERS_M, AROUND_M, OBJECT_M = 0.028, 0.0, 0.003, 0.003, 0.001
@@ -62,7 +67,8 @@ class Gripper(NamedTuple):
 
     `fingers`, `pads`: its two sides: a body, and the point in its frame that touches [m]. `T_tip_grip`: between the
     pads, z along the fingers, y the direction in which they close. `opening`: [m]. `joints`: addresses of its joints in
-    `qpos`; `open`, `closed`: their positions; `sides`: the nearest geoms of both sides.
+    `qpos`; `open`, `closed`: their positions; `sides`: the nearest geoms of both sides. `force`: with which each side
+    presses when it is driven by motors [N]; infinite with servos, whose force depends on what stops them.
     """
 
     fingers: tuple[str, str]
@@ -73,6 +79,12 @@ class Gripper(NamedTuple):
     open: Floats
     closed: Floats
     sides: tuple[int, int]
+    force: float
+
+
+def compute_error(tip: PoseTuple, goal: PoseTuple) -> float:
+    """Return how far a tip is from its goal, in units of what counts as arrived."""
+    return max(distance(tip[0], goal[0]) / ARRIVED_M, quat_angle(tip[1], goal[1]) / ARRIVED_RAD)
 
 
 class PlannedArm:
@@ -99,22 +111,38 @@ class PlannedArm:
         """Return joint positions at a goal, found by few large steps from others, `None` where that fails: a cheap
         check before `follow`.
         """
-        chain, model, data = self.chain, self.chain.model, self.chain.data
+        chain = self.chain
         lower, upper = self._lower[chain.to_chain], self._upper[chain.to_chain]
         p_goal, q_goal = compose(inverse(self.T_world_root), goal)
-        error, J = np.empty(6), np.empty((6, model.nv))
+        error = np.empty(6)
         for _ in range(TRIES):
             (x, y, z), quat = chain.forward_kinematics(q)
             error[:3] = p_goal[0] - x, p_goal[1] - y, p_goal[2] - z
             error[3:] = quat_to_rotvec(quat_mul(q_goal, quat_conj(quat)))
             if math.hypot(*error[:3]) < ARRIVED_M and math.hypot(*error[3:]) < ARRIVED_RAD:
                 return q
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_jacSite(model, data, J[:3], J[3:], 0)
+            J = self._compute_jacobian()
             step = J.T @ np.linalg.solve(J @ J.T + DAMPING * np.eye(6), error)
             step *= min(1.0, MAX_STEP / max(float(np.abs(step).max()), 1e-9))
             q = np.clip(q[chain.to_chain] + step, lower, upper)[chain.from_chain]
         return None
+
+    def can_reach(self, goal: PoseTuple) -> bool:
+        """Return whether some posture within joint limits reaches a goal, wherever the arm begins."""
+        rng, lower, upper = np.random.default_rng(0), np.maximum(self._lower, -3.0), np.minimum(self._upper, 3.0)
+        return any(self.jump(rng.uniform(lower, upper), goal) is not None for _ in range(POSTURES))
+
+    def is_singular(self) -> bool:
+        """Return whether the tip cannot move or turn every way at rest: joints are straight, or axes aligned."""
+        self.find_tip(self.rest)
+        return float(np.linalg.svd(self._compute_jacobian(), compute_uv=False)[-1]) < SINGULAR
+
+    def _compute_jacobian(self) -> Floats:
+        """Return the Jacobian of the tip at the joints of the last `forward_kinematics`, shape (6, n)."""
+        model, data, J = self.chain.model, self.chain.data, np.empty((6, self.chain.model.nv))
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jacSite(model, data, J[:3], J[3:], 0)
+        return J
 
     def follow(self, q: Floats, goal: PoseTuple) -> tuple[list[Floats], float]:
         """Move the tip straight to a goal as people do.
@@ -137,7 +165,7 @@ class PlannedArm:
                 continue
             tip = self.find_tip(q)
             missing, before = distance(tip[0], goal[0]), off
-            off = max(missing / ARRIVED_M, quat_angle(tip[1], goal[1]) / ARRIVED_RAD)
+            off = compute_error(tip, goal)
             if off < 1.0:
                 return way, 0.0
             if off > 0.95 * before:
@@ -169,9 +197,10 @@ class PlanningScene:
                 self.arms[robot.name] = PlannedArm(self._model, robot, self._data)
             except NoGripperError as error:
                 self.without[robot.name] = str(error)
-        body = self._model.body(thing.body).id
+        body = find_element_id(self._model, "body", thing.body)
         self._object_at = int(self._model.jnt_qposadr[self._model.body_jntadr[body]])
         self.T_world_object = _read_pose(self._data, body)
+        self._weight = float(model.body_subtreemass[body] * np.linalg.norm(model.opt.gravity))
         self._qpos = self._data.qpos.copy()
         self._widths: dict[tuple[str, float], Floats] = {}
         self._sort_geoms(robots, body)
@@ -187,9 +216,9 @@ class PlanningScene:
         owner = np.full(model.nbody, ENVIRONMENT)
         owner[tree.list_subtree(body)] = OBJECT
         for index, robot in enumerate(robots):
-            first = int(model.jnt_bodyid[model.joint(robot.joints[0]).id])
+            first = int(model.jnt_bodyid[find_element_id(model, "joint", robot.joints[0])])
             owner[tree.list_subtree(first)] = index
-        fingers = {model.body(name).id for robot in robots for name in robot.finger_bodies}
+        fingers = {find_element_id(model, "body", name) for robot in robots for name in robot.finger_bodies}
         touches = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         self._owner = np.where(touches, owner[model.geom_bodyid], ENVIRONMENT)
         self._is_finger = np.isin(model.geom_bodyid, list(fingers))
@@ -201,6 +230,30 @@ class PlanningScene:
         p = self._data.geom_xpos[geom] + self._data.geom_xmat[geom].reshape(3, 3) @ centre
         T_world_box = (_to_vector(p), _to_quat(quat))
         return compose(inverse(_read_pose(self._data, body)), T_world_box), _to_vector(half)
+
+    def find_weak_motor(self, name: str, q: Floats) -> str:
+        """Return what motors cannot hold: an arm at joint positions, or its gripper the object; empty: nothing."""
+        model, gripper, arm = self._model, self.grippers[name], self.arms[name]
+        geoms = [*gripper.sides, *np.flatnonzero(self._owner == OBJECT)]
+        friction = 2.0 * float(model.geom_friction[geoms, 0].max()) * gripper.force
+        if friction < self._weight:
+            return (
+                f"the gripper of '{name}' presses with {gripper.force:.2g} N and holds {friction:.2g} N by friction, "
+                f"but it weighs {self._weight:.2g} N"
+            )
+        data = mujoco.MjData(model)
+        data.qpos[:] = self._qpos
+        data.qpos[arm.addresses] = q
+        mujoco.mj_forward(model, data)
+        for joint, actuator in zip(arm.chain.joint_ids, arm.spec.actuators, strict=True):
+            a, dof = find_element_id(model, "actuator", actuator), model.jnt_dofadr[joint]
+            most = abs(model.actuator_gainprm[a, 0]) * np.abs(model.actuator_ctrlrange[a]).max()
+            needed = abs(data.qfrc_bias[dof] - data.qfrc_gravcomp[dof]) / abs(model.actuator_gear[a, 0])
+            if _is_motor(model, a) and model.actuator_ctrllimited[a] and most < needed:
+                unit = "N" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else "N m"
+                takes = f"holding '{name}' on its way takes {needed:.2g} {unit}"
+                return f"motor '{actuator}' has {most:.2g} {unit}, but {takes}"
+        return ""
 
     def find_clash(
         self,
@@ -225,7 +278,8 @@ class PlanningScene:
 
     def _describe(self, geom: int) -> str:
         owner = int(self._owner[geom])
-        body = self._model.body(int(self._model.geom_bodyid[geom])).name
+        of = int(self._model.geom_bodyid[geom])
+        body = self._model.body(of).name if of else self._model.geom(geom).name
         return "the object" if owner == OBJECT else self._names[owner] if owner >= 0 else body or "the surroundings"
 
     def _list_close(
@@ -288,7 +342,7 @@ def _settle(model: mujoco.MjModel, state: Any, robots: Sequence[RobotSpec], *, o
     """Return the state after grippers have opened or closed and objects have come to rest; arms stand still."""
     data = mujoco.MjData(model)
     mujoco.mj_copyData(data, model, state)
-    moving = {int(model.jnt_bodyid[model.joint(robot.joints[-1]).id]) for robot in robots}
+    moving = {int(model.jnt_bodyid[find_element_id(model, "joint", robot.joints[-1])]) for robot in robots}
     tree = KinematicTree(model)
     below = {b for link in moving for b in tree.list_subtree(link)} - moving
     free = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -297,7 +351,7 @@ def _settle(model: mujoco.MjModel, state: Any, robots: Sequence[RobotSpec], *, o
     before = data.qpos[positions].copy()
     for robot in robots:
         for one in robot.gripper_actuators:
-            data.ctrl[model.actuator(one.actuator).id] = one.open if opened else one.closed
+            data.ctrl[find_element_id(model, "actuator", one.actuator)] = one.open if opened else one.closed
     for _ in range(math.ceil(SETTLE_S / model.opt.timestep)):
         mujoco.mj_step(model, data)
         data.qpos[positions], data.qvel[dofs] = before, 0.0
@@ -309,14 +363,14 @@ def measure_gripper(model: mujoco.MjModel, robot: RobotSpec, opened: Any, closed
     """Return the gripper of a robot from the scene with it open and closed. Raises `NoGripperError`."""
     tip = Tip(model, robot)
     T_world_tip = tip.read_pose(opened)
-    bodies = [model.body(name).id for name in robot.finger_bodies]
+    bodies = [find_element_id(model, "body", name) for name in robot.finger_bodies]
     touches = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies) & touches)
     moved = closed.geom_xpos[geoms] - opened.geom_xpos[geoms]
     if not len(geoms) or float(np.abs(moved).max()) < MIN_OPENING / 2.0:
         raise NoGripperError("has fingers that do not move or cannot touch anything")
     across = np.linalg.svd(moved, full_matrices=False)[2][0]
-    link = int(model.jnt_bodyid[model.joint(robot.joints[-1]).id])
+    link = int(model.jnt_bodyid[find_element_id(model, "joint", robot.joints[-1])])
     centre = np.array(T_world_tip[0])
     fingers_at = opened.geom_xpos[geoms].mean(axis=0)
     ahead = centre - opened.xpos[link] + (fingers_at - opened.xpos[link])
@@ -343,7 +397,7 @@ def measure_gripper(model: mujoco.MjModel, robot: RobotSpec, opened: Any, closed
     for geom, at in zip(pair, touching, strict=True):
         body = int(model.geom_bodyid[geom])
         local = opened.xmat[body].reshape(3, 3).T @ (centre + depth * z + at * y - opened.xpos[body])
-        names.append(model.body(body).name)
+        names.append(list_body_names(model)[body])
         pads.append(_to_vector(local))
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, frame.ravel())
@@ -360,7 +414,25 @@ def measure_gripper(model: mujoco.MjModel, robot: RobotSpec, opened: Any, closed
         opened.qpos[joints].copy(),
         closed.qpos[joints].copy(),
         (pair[0], pair[1]),
+        _compute_motor_force(
+            model, robot, opened, closed, opening - mujoco.mj_geomDistance(model, closed, *pair, 1.0, None)
+        ),
     )
+
+
+def _is_motor(model: mujoco.MjModel, actuator: int) -> bool:
+    return not (model.actuator_biastype[actuator] or model.actuator_dyntype[actuator])
+
+
+def _compute_motor_force(model: mujoco.MjModel, robot: RobotSpec, opened: Any, closed: Any, travel: float) -> float:
+    """Return the force between the fingers from the work of their motors over `travel` [m], see `Gripper.force`."""
+    work = 0.0
+    for one in robot.gripper_actuators:
+        a = find_element_id(model, "actuator", one.actuator)
+        if not _is_motor(model, a):
+            return math.inf
+        work += model.actuator_gainprm[a, 0] * one.closed * (closed.actuator_length[a] - opened.actuator_length[a])
+    return abs(float(work)) / max(travel, 1e-6)
 
 
 def _snap_frame(tip: Floats, across: Floats, ahead: Floats) -> Floats:

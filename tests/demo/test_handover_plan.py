@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from pathlib import Path
 
 import mujoco
@@ -87,6 +89,68 @@ def test_scene_without_a_second_gripper_is_refused() -> None:
         spec.delete(key)
     with pytest.raises(ConfigError, match="two arms with grippers, the scene has 1; 'right' has no gripper"):
         plan(spec)
+
+
+def test_plan_needs_no_names() -> None:
+    spec = make_scene(6)
+    for element in (spec.body("left/finger_a"), *(one for one in spec.actuators if one.name.startswith("left/"))):
+        element.name = ""
+    giver = plan(spec, giver="left").giver
+    assert any(finger.startswith("body_") for finger in giver.fingers)
+
+
+def without_keyframe(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    for key in list(spec.keys):
+        spec.delete(key)
+    return spec
+
+
+def use_motors(spec: mujoco.MjSpec, names: str, most: float) -> mujoco.MjSpec:
+    """Let actuators whose names contain this push with a force up to `most` [N, N m] instead of to a position."""
+    for body in spec.bodies:
+        body.gravcomp = 0.0
+    for actuator in (one for one in spec.actuators if names in one.name):
+        actuator.biastype, actuator.gainprm[0] = mujoco.mjtBias.mjBIAS_NONE, 1.0
+        actuator.ctrlrange = (-most, most)
+    return spec
+
+
+def test_arm_that_begins_straight_is_asked_for_a_keyframe() -> None:
+    why = "'left' begins straight or with aligned axes .singular.: a keyframe 'home' with bent joints"
+    with pytest.raises(ConfigError, match=f"are missing from above.*; {why}"):
+        plan(without_keyframe(make_scene(6)), "cube", "left", "right")
+
+
+def test_arm_with_few_joints_lacks_turn_and_not_reach() -> None:
+    spec = without_keyframe(make_scene(6))
+    for side, k in itertools.product(("left", "right"), (4, 6)):
+        spec.delete(spec.actuator(f"{side}/joint{k}"))
+        spec.delete(spec.joint(f"{side}/joint{k}"))
+    why = r"'left' does not reach it where it lies: \d+ degrees of turn are missing from above; 'left' has 4 joints"
+    with pytest.raises(ConfigError, match=why):
+        plan(spec)
+
+
+def test_motors_that_cannot_hold_are_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"the gripper of 'left' presses with 0.1 N and holds .* N by friction, but it weighs"
+    ):
+        plan(use_motors(make_scene(6), "finger", 0.1))
+    with pytest.raises(
+        ConfigError, match=r"motor 'left/joint2' has 2 N m, but holding 'left' on its way takes [\d.]+ N m"
+    ):
+        plan(use_motors(make_scene(6), "joint", 2.0))
+    assert plan(use_motors(use_motors(make_scene(6), "joint", 150.0), "finger", 40.0)).object == "cube"
+
+
+def test_operator_says_that_the_object_slipped_and_where_it_lies() -> None:
+    spec = make_scene(6)
+    for geom in spec.geoms:
+        geom.friction[0] = 0.002
+    rig = make_rig(spec.compile(), 6)
+    rig.run(60.0, until=Rig.over)
+    slip = r"the cube slipped out of the gripper of left 0\.\d s after it closed"
+    assert re.match(rf"{slip}; the cube lies \d+ mm and \d+ degrees from its", rig.behaviours["left"].failed)
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,7 @@ class HandoverTask(PhasedTask):
         self._clutched_again = 0
         self._take_x = 0.0  # position of the grasp along the object [m]
         self._after_close = ""
+        self._closed_s = 0.0  # when the object was last seen in the closed gripper
 
     # --- phases that both know ----------------------------------------------------------------------------------------
 
@@ -83,6 +84,7 @@ class HandoverTask(PhasedTask):
             self.hand.hold_still()
             self.hand.trigger_goal = 1.0
         if self.hand.is_trigger_done() and self._has_lasted(0.7) and self._is_holding():
+            self._closed_s = self.hand.now_s
             self._enter(self._after_close)
         elif self._has_lasted(2.5):
             self._retry(f"{self.robot} closed its gripper beside the {self.object}")
@@ -144,6 +146,10 @@ class HandoverTask(PhasedTask):
         """Return True if the object is no longer between the fingers."""
         taken_at = apply(self.perception.get_body(self.object), (self._take_x, 0.0, 0.0))
         return distance(taken_at, self.perception.get_tip(self.robot)[0]) > 0.05
+
+    def _describe_slip(self) -> str:
+        held_s = self.hand.now_s - self._closed_s
+        return f"the {self.object} slipped out of the gripper of {self.robot} {held_s:.1f} s after it closed"
 
     def _compute_tip(self, T_world_thing: PoseTuple) -> PoseTuple:
         """Return the tip pose that brings the object, as it lies in the gripper, to `T_world_thing`."""
@@ -226,7 +232,7 @@ class Giver(HandoverTask):
         if self._entering_now:
             self.hand.move_to(raise_pose(self.perception.get_tip(self.robot), self._lift_m))
         if self._has_lost_object():
-            self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
+            self._retry(self._describe_slip())
         elif self.hand.has_arrived(0.015, 0.06) or self._has_lasted(4.0):
             self._enter("present")
 
@@ -234,7 +240,7 @@ class Giver(HandoverTask):
         if self._entering_now:
             self.hand.move_to(self._compute_tip(self._compute_offer_pose()))
         if self._has_lost_object():
-            self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
+            self._retry(self._describe_slip())
         elif self.hand.has_arrived(0.008, 0.05) or self._has_lasted(8.0):
             self._enter("offer")
 
@@ -259,7 +265,7 @@ class Giver(HandoverTask):
         if distance(self.perception.get_tip(self.partner)[0], self._find_partner_grasp()) < 0.07:
             self.hand.hold_still()
         if self._has_lost_object():
-            self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
+            self._retry(self._describe_slip())
         elif not self._is_held_by(self.partner):
             self._taken_since_s = math.inf
             if self._has_lasted(self._patience_s):
@@ -364,7 +370,7 @@ class Receiver(HandoverTask):
         if self._is_open(self.partner) and away > LEFT_M:
             self._enter("carry")
         elif self._has_lasted(1.0) and not self._is_holding():
-            self._retry(f"the {self.object} slipped out of the gripper of {self.robot}")
+            self._retry(self._describe_slip())
         elif self._has_lasted(15.0):
             self._retry(f"{self.partner} did not release the {self.object}")
 

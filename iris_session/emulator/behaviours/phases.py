@@ -29,6 +29,7 @@ class PhasedTask:
         self.done = False
         self.failed = ""
         self.attempts = 1
+        self.fault = ""  # of the attempt before this one
         self.robot, self.arm = robot, arm
         self.hand = ClutchedHand(device, robot, arm.speed)
         self.perception = eyes
@@ -130,6 +131,7 @@ class PhasedTask:
             self._fail(f"{reason} (after {self.attempts} attempts)")
             return
         self.attempts += 1
+        self.fault = reason
         self._enter("back_off")
 
     def _fail(self, reason: str) -> None:

@@ -89,11 +89,12 @@ class PlannedGiver(PlannedTask, Giver):
         if self.perception.get_still_s(self.object) < 0.3:
             return
         (p, q), (p_planned, q_planned) = self.perception.get_body(self.object), self.plan.T_world_lying
-        if distance(p, p_planned) < MOVED_M and quat_angle(q, q_planned) < MOVED_RAD:
+        away, turn = distance(p, p_planned), quat_angle(q, q_planned)
+        if away < MOVED_M and turn < MOVED_RAD:
             self._enter("approach")
         elif self._has_lasted(2.0):
-            moved_mm = 1e3 * distance(p, p_planned)
-            self._fail(f"the {self.object} lies {moved_mm:.0f} mm from its planned place, or turned")
+            off = f"{1e3 * away:.0f} mm and {math.degrees(turn):.0f} degrees"
+            self._fail("; ".join(filter(None, (self.fault, f"the {self.object} lies {off} from its planned place"))))
 
     def _compute_offer_pose(self) -> PoseTuple:
         return self.plan.T_world_meeting
@@ -119,7 +120,7 @@ class PlannedReceiver(PlannedTask, Receiver):
     def _keep(self) -> None:
         """Make sure that it is still held."""
         if self._has_lost_object():
-            self._fail(f"{self.robot} dropped the {self.object}")
+            self._fail(self._describe_slip())
         elif self._has_lasted(0.5):
             self._finish()
 
