@@ -525,11 +525,24 @@ class Controller:
         speed = joints.velocity
         wanted = np.minimum(np.maximum((joints.goal - joints.q) / joints.remaining, -speed), speed)
         if joints.moving:
-            factors = self._proximity.compute_speed_factors(data, [wanted[columns] for columns in self._columns])
+            moving, stops = None, None
+            if self._config.proximity_stopped:
+                moving, stops = [joints.v[columns] for columns in self._columns], self._find_stops(data)
+            speeds = [wanted[columns] for columns in self._columns]
+            factors = self._proximity.compute_speed_factors(data, speeds, moving, stops)
         for i, (r, factor) in enumerate(zip(self._states, factors, strict=True)):
             columns = self._columns[i]
             r.proximity = 1.0 if r.latch is None else float(factor.min())
             joints.near[columns] = speed[columns] if r.proximity == 1.0 else np.abs(wanted[columns]) * factor
+
+    def _find_stops(self, data: mujoco.MjData) -> Floats:
+        """Return `qpos`, shape (nq,), where the joints that are driven or brake come to a stop if they brake at the
+        next check; all else is where it is measured."""
+        joints, stops = self._joints, np.array(data.qpos)
+        travel = joints.v * (self._check_ticks * self._dt) + np.sign(joints.v) * joints.find_stop_distance(joints.v)
+        moves = self._latched | (joints.v != 0.0)
+        stops[self._qpos[moves]] = (joints.get_position(slice(None)) + travel)[moves]
+        return stops
 
     def _move_targets(self, data: mujoco.MjData) -> None:
         """Output `targets`: move end-effector targets at bounded speed; the environment's controller does the rest.

@@ -117,6 +117,29 @@ def test_an_arm_stretched_towards_another_comes_back_without_coming_nearer() -> 
     assert apart(jammed.tip(), home)[0] > 0.4, "recordings made before are verified with the law of then"
 
 
+def roam(seed: int, seconds: float, **settings: object) -> float:
+    """Both arms are sent to other random poses between them every 0.4 s; returns the smallest gap."""
+    rig, _ = make_handover(**settings)
+    rng, proximity, smallest = np.random.default_rng(seed), rig.controller._proximity, 1.0
+    goals: list[PoseTuple] = []
+    for k in range(round(seconds / rig.model.opt.timestep)):
+        if k % 100 == 0:
+            places = rng.uniform((-0.45, -0.4, 0.0), (0.45, 0.4, 0.7), (2, 3))
+            turns = rng.normal(size=(2, 4))
+            turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+            goals = [(tuple(p), tuple(q)) for p, q in zip(places.tolist(), turns.tolist(), strict=True)]
+        rows = [rig.source(*goal, absolute=True, device="target", new=k % 2 == 0) for goal in goals]
+        rig.step(decision(pose_command(robot.name, row) for robot, row in zip(rig.robots, rows, strict=True)))
+        smallest = min([smallest, *(pair[0] for pair in proximity._near_geoms(rig.data, 0, 1)[:1])])
+    return smallest
+
+
+@pytest.mark.parametrize("seed", [5, 9])
+def test_arms_at_full_speed_stop_apart(seed: int) -> None:
+    assert roam(seed, 8.0) > 0.02
+    assert roam(seed, 8.0, proximity_stopped=False) < 0.0, "the law of earlier recordings lets servos run on"
+
+
 def test_no_pair_closes_faster_than_allowed_and_joints_that_open_all_of_them_are_not_slowed() -> None:
     model, robots = panda_arms([(0.0, 0.0, 0.0), (0.75, 0.0, 0.0), (0.4, 0.5, 0.0)], [0.0, math.pi, -math.pi / 2])
     rig, rng, slowed, kept = Rig(model, robots, home=PANDA_HOME), np.random.default_rng(2), 0, 0
@@ -182,6 +205,22 @@ def factors(apart: float, va: float, vb: float, finger: float = 0.0) -> list[flo
 )
 def test_closing_speed_is_bounded_by_distance(apart: float, va: float, vb: float, expected: list[float]) -> None:
     assert factors(apart, va, vb)[:2] == pytest.approx(expected, abs=1e-9)
+
+
+def test_where_they_would_stop_counts_too_and_a_retreat_counts_as_far_as_it_has_begun() -> None:
+    model, data, robots = sliders(0.4)
+    proximity = ProximityLimiter(model, robots, ControlConfig())
+    still, ahead, back = (np.array([v]) for v in (0.0, 1.0, 0.5))
+
+    def slow(moving_b: float, stops: list[float]) -> list[float]:
+        moving = [ahead, np.array([moving_b]), still]
+        found = proximity.compute_speed_factors(data, [ahead, back, still], moving, np.array(stops))
+        return [float(factor.item()) for factor in found[:2]]
+
+    assert slow(0.5, [0.0, 0.0, 0.0]) == [1.0, 1.0]
+    assert slow(0.5, [0.15, 0.0, 0.0]) == pytest.approx([0.62, 1.0])  # 5 cm apart when they stop
+    assert slow(0.2, [0.15, 0.0, 0.0]) == pytest.approx([0.32, 1.0])
+    assert slow(-0.2, [0.15, 0.0, 0.0]) == pytest.approx([0.12, 1.0])
 
 
 def test_fingers_are_exempt() -> None:
