@@ -163,9 +163,8 @@ def test_samples_between_two_checks_do_not_lift_the_bound() -> None:
     towards = np.array([0.0, 0.19, 0.0, 0.19, 0.0, 0.0, 0.0])
     for k in range(1000):
         # Leaders that retreat whenever they are looked at, and come nearer else.
-        goals = rig.controller._joints.get_position(slice(None)).reshape(2, -1) + (
-            towards if rig.controller._tick % 5 else -0.05 * np.sign(towards)
-        )
+        step = towards if rig.controller._tick % 5 else -0.05 * np.sign(towards)
+        goals = rig.controller._joints.get_position(slice(None)).reshape(2, -1) + step
         rows = [rig.source((0.0, 0.0, 0.0), pose_world=None, q=tuple(q), device="joints") for q in goals.tolist()]
         rig.step(decision(Command(r.name, "joints", sources=(row,)) for r, row in zip(robots, rows, strict=True)))
         if k % 5 == 0:
