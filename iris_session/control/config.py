@@ -121,6 +121,7 @@ class ControlConfig(msgspec.Struct, frozen=True):
     proximity_gain: float = 4.0  # [1/s]: closing speed <= gain * (distance - stop)
     proximity_period_s: float = 0.01
     proximity_per_joint: bool = True  # only joints that close the distance are slowed; False: all of the robot alike
+    proximity_stopped: bool = True  # distances also of where the robots would stop; False: only as they are
     compensate_sag: bool = True  # position servos carry gravity, payloads and friction: see `sag`
     tracking_error: float = 0.3  # [rad or m]: joints further than this from where they are commanded are reported
     # --- objects held by hands without a robot

@@ -26,7 +26,7 @@ from iris_session.control.grasp import Grasps
 from iris_session.control.hold import HoldLaw
 from iris_session.control.ik import InverseKinematics
 from iris_session.control.interpolate import JointInterpolator, read_speed_limits
-from iris_session.control.proximity import ProximityLimiter
+from iris_session.control.proximity import Motion, ProximityLimiter, SpeedFactors
 from iris_session.control.sag import SAG, SagCompensation
 from iris_session.control.state import ControllerState, RobotControlState, decode_state, encode_state
 from iris_session.physics.tip import Tip
@@ -85,7 +85,8 @@ class Controller:
         driven = self._robots if self._writes_ctrl else ()
         self._laws = ActuatorLaws(model, driven, self._config)
         self._bounds = (self._laws.lower, self._laws.upper) if driven else read_joint_ranges(model, self._arms)
-        self._joints = JointInterpolator(*read_speed_limits(model, self._robots, self._arms, self._config), self._dt)
+        speeds = read_speed_limits(model, self._robots, self._arms, self._config)
+        self._joints = JointInterpolator(*speeds, self._dt, one_way=self._config.proximity_stopped)
         dof = np.array([model.jnt_dofadr[j] for arm in self._arms for j in arm.joint_ids], dtype=np.intp)
         self._hold: HoldLaw | None = None
         if self._writes_ctrl:
@@ -521,15 +522,36 @@ class Controller:
         A robot that holds is not bounded: it brakes as hard as it can already.
         """
         joints = self._joints
-        factors = [np.ones(1)] * len(self._states)
+        factors, near = SpeedFactors([np.ones(1)] * len(self._states), frozenset())
         speed = joints.velocity
         wanted = np.minimum(np.maximum((joints.goal - joints.q) / joints.remaining, -speed), speed)
         if joints.moving:
-            factors = self._proximity.compute_speed_factors(data, [wanted[columns] for columns in self._columns])
+            motions, stops = None, None
+            if self._config.proximity_stopped:
+                change = joints.acceleration * (self._check_ticks * self._dt)
+                least = np.clip(wanted, joints.v - change, joints.v + change)
+                motions = [Motion(wanted[c], joints.v[c], least[c]) for c in self._columns]
+                stops = self._find_stops(data, least)
+            speeds = [wanted[columns] for columns in self._columns]
+            factors, near = self._proximity.compute_speed_factors(data, speeds, motions, stops)
         for i, (r, factor) in enumerate(zip(self._states, factors, strict=True)):
             columns = self._columns[i]
             r.proximity = 1.0 if r.latch is None else float(factor.min())
-            joints.near[columns] = speed[columns] if r.proximity == 1.0 else np.abs(wanted[columns]) * factor
+            # Near another robot no joint gets faster than it wants to be now, or turns round, whatever the next sample
+            # wants.
+            if joints.one_way:
+                joints.near[columns] = wanted[columns] * factor if i in near else np.inf
+            else:
+                joints.near[columns] = speed[columns] if r.proximity == 1.0 else np.abs(wanted[columns]) * factor
+
+    def _find_stops(self, data: mujoco.MjData, v: Floats) -> Floats:
+        """Return `qpos`, shape (nq,), where joints come to a stop that brake from the next check on, with the speeds
+        `v` by then, shape (n,); what is not driven and does not brake is where it is measured."""
+        joints, stops = self._joints, np.array(data.qpos)
+        travel = v * (self._check_ticks * self._dt) + np.sign(v) * joints.find_stop_distance(v)
+        moves = self._latched | (joints.v != 0.0)
+        stops[self._qpos[moves]] = (joints.get_position(slice(None)) + travel)[moves]
+        return stops
 
     def _move_targets(self, data: mujoco.MjData) -> None:
         """Output `targets`: move end-effector targets at bounded speed; the environment's controller does the rest.

@@ -25,16 +25,19 @@ class JointInterpolator:
     """Commanded positions `q` and velocities `v` of n joints, moving to `goal`. All arrays float64, shape (n,).
 
     `cap`: velocity limit in force now (ramps lower it); `near`: the one that proximity sets, apart from `cap` so that
-    neither undoes the other; the lower of both counts. `remaining`: time to arrive in [s].
+    neither undoes the other; the lower of both counts. `one_way`: `near` has a sign, and forbids the other direction;
+    infinite where it limits nothing. `remaining`: time to arrive in [s].
     `before`, `before_v`: `q` and `v` before this tick. `support`: the part of `q` and `goal` that carries loads: the
     joints shall stand at `goal - support` (`sag`). `None` without compensation.
     """
 
-    def __init__(self, velocity: Floats, acceleration: Floats, dt: float) -> None:
+    def __init__(self, velocity: Floats, acceleration: Floats, dt: float, one_way: bool = False) -> None:
         n = len(velocity)
         self.q, self.v, self.goal, self.remaining = np.zeros(n), np.zeros(n), np.zeros(n), np.full(n, dt)
         self.before, self.before_v = np.zeros(n), np.zeros(n)
-        self.velocity, self.cap, self.near = velocity, velocity.copy(), velocity.copy()
+        self.one_way = one_way
+        self.free = np.full(n, np.inf) if one_way else velocity
+        self.velocity, self.cap, self.near = velocity, velocity.copy(), self.free.copy()
         self.acceleration = acceleration
         self.dt = dt
         self._dv = acceleration * dt
@@ -48,7 +51,7 @@ class JointInterpolator:
         self.goal[:] = q
         self.v[:] = 0.0
         self.remaining[:] = self.dt
-        self.cap[:] = self.near[:] = self.velocity
+        self.cap[:], self.near[:] = self.velocity, self.free
         self.moving = False
         if self.support is not None:
             self.support[:] = 0.0
@@ -59,7 +62,7 @@ class JointInterpolator:
         self.goal[joints] = q
         self.v[joints] = 0.0
         self.remaining[joints] = self.dt
-        self.cap[joints] = self.near[joints] = self.velocity[joints]
+        self.cap[joints], self.near[joints] = self.velocity[joints], self.free[joints]
         if self.support is not None:
             self.support[joints] = 0.0
 
@@ -107,8 +110,10 @@ class JointInterpolator:
         distance = np.abs(error) / self._unit
         ticks = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * distance) - 1.0))
         brake = (ticks + (distance - 0.5 * ticks * (ticks + 1.0)) / (ticks + 1.0)) * self._dv
-        limit = np.minimum(brake, np.minimum(self.cap, self.near))
+        limit = np.minimum(brake, np.minimum(self.cap, np.abs(self.near)))
         wanted = np.minimum(np.maximum(error / self.remaining, -limit), limit)
+        if self.one_way:
+            wanted[np.isfinite(self.near) & (np.sign(wanted) == -np.sign(self.near))] = 0.0
         self.v += np.minimum(np.maximum(wanted - self.v, -self._dv), self._dv)
         self.q += self.v * self.dt
         np.maximum(self.remaining - self.dt, self.dt, out=self.remaining)

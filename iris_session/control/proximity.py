@@ -1,5 +1,9 @@
 """Proximity of robots: the speed at which two robots approach each other is bounded by their distance.
 
+The distance is that of the robots where they are measured, and that where they come to a stop if they brake from the
+next check on: servos follow with a delay (0.1 s of a Panda), and brakes take time, so fast arms have centimetres before
+them that no later command takes back. Each bounds the speed.
+
 Distances are measured on the whole scene between the robots' geoms, finger bodies exempt: grippers must meet to hand
 objects over. Broad phase: boxes around each robot's geoms; then bounding spheres; then `mj_geomDistance` for the
 nearest pairs. Where many bounding spheres overlap (long links), oriented boxes bound the distances, and the nearest
@@ -43,8 +47,30 @@ class _Approach(NamedTuple):
     robots: tuple[tuple[int, Floats], tuple[int, Floats]]
 
 
+class Motion(NamedTuple):
+    """Joint velocities of one robot until the next check, shape (n,) each [rad/s].
+
+    `wanted`: towards the goal. `now`: as they are: a joint that approaches counts, although it wants to retreat, as the
+    next sample may want something else. `least`: as near to `wanted` as they can come: no joint retreats faster.
+    """
+
+    wanted: Floats
+    now: Floats
+    least: Floats
+
+
+class SpeedFactors(NamedTuple):
+    """Factors 0..1 on the joint speeds of each robot: one per joint, or one for all, shape (n_i,) or (1,).
+
+    `near`: indices of robots that are near another one, slowed or not.
+    """
+
+    robots: list[Floats]
+    near: frozenset[int]
+
+
 class ProximityLimiter:
-    """Speed factors per robot from their distances. Stateless: everything follows from the arguments."""
+    """Speed factors per robot from their distances. Everything follows from the arguments."""
 
     def __init__(self, model: mujoco.MjModel, robots: Sequence[RobotSpec], config: ControlConfig) -> None:
         self._model = model
@@ -63,35 +89,55 @@ class ProximityLimiter:
         self._jacobian = np.zeros((3, model.nv))
         self._segment = np.zeros(6)
         self.active = config.proximity_margin > 0.0 and sum(len(g) > 0 for g in self._geoms) > 1
+        self._stopped = mujoco.MjData(model) if self.active and config.proximity_stopped else None
 
-    def compute_speed_factors(self, data: mujoco.MjData, wanted: Sequence[Floats]) -> list[Floats]:
-        """Return factors 0..1 on the joint speeds of each robot: one per joint, or one for all, shape (n_i,) or (1,).
+    def compute_speed_factors(
+        self,
+        data: mujoco.MjData,
+        wanted: Sequence[Floats],
+        motions: Sequence[Motion] | None = None,
+        stops: Floats | None = None,
+    ) -> SpeedFactors:
+        """Return by which factors robots are slowed.
 
-        `wanted`: joint velocities [rad/s] each robot would take, (n_i,).
+        `wanted`: joint velocities [rad/s] each robot would take, (n_i,). `motions`: those and others. `stops`: `qpos`
+        where the robots come to a stop if they brake at the next check, shape (nq,). Without these two it is the law of
+        earlier recordings.
         """
         per_joint = self._config.proximity_per_joint
         factors = [np.ones(len(joints) if per_joint else 1) for joints in wanted]
-        approaches = self._list_approaches(data, wanted)
+        approaches = self._list_approaches(data, wanted, motions)
+        if self._stopped is not None and stops is not None:
+            self._stopped.qpos[:] = stops
+            self._stopped.mocap_pos[:], self._stopped.mocap_quat[:] = data.mocap_pos, data.mocap_quat
+            mujoco.mj_kinematics(self._model, self._stopped)
+            mujoco.mj_comPos(self._model, self._stopped)  # for Jacobians
+            approaches += self._list_approaches(self._stopped, wanted, motions)
+        near = frozenset(i for approach in approaches for i, _ in approach.robots)
         for _ in range(_SWEEPS if per_joint else 1):
             before, factors = factors, _slow_approaches(approaches, factors)
             if all(float((b - f).max()) < _SETTLED for b, f in zip(before, factors, strict=True)):
-                return factors
-        return _slow_approaches(approaches, factors, share=False) if per_joint else factors
+                return SpeedFactors(factors, near)
+        if per_joint:
+            factors = _slow_approaches(approaches, factors, share=False)
+        return SpeedFactors(factors, near)
 
-    def _list_approaches(self, data: mujoco.MjData, wanted: Sequence[Floats]) -> list[_Approach]:
-        """Return the nearest pairs of robots of which at least one moves."""
+    def _list_approaches(
+        self, data: mujoco.MjData, wanted: Sequence[Floats], motions: Sequence[Motion] | None = None
+    ) -> list[_Approach]:
+        """Return the nearest pairs of robots, without `motions` only those of which one moves."""
         approaches = []
         moves = [bool(joints.any()) for joints in wanted]
         for a, b in self._near_robots(data):
-            if not (moves[a] or moves[b]):  # neither robot approaches
+            if motions is None and not (moves[a] or moves[b]):  # neither robot approaches
                 continue
             for distance, geom_a, geom_b, p_a, p_b in self._near_geoms(data, a, b):
                 gap = p_b - p_a
                 # Points of penetrating geoms are swapped: the direction from a to b stays the same.
                 normal = gap / math.copysign(max(float(np.linalg.norm(gap)), 1e-9), distance)
                 allowed = max(0.0, self._config.proximity_gain * (distance - self._config.proximity_stop))
-                closing_a = self._closing_speeds(data, a, geom_a, p_a, normal, wanted[a])
-                closing_b = -self._closing_speeds(data, b, geom_b, p_b, normal, wanted[b])
+                closing_a = self._closing_speeds(data, a, geom_a, p_a, normal, wanted[a], motions and motions[a])
+                closing_b = self._closing_speeds(data, b, geom_b, p_b, -normal, wanted[b], motions and motions[b])
                 approaches.append(_Approach(allowed, ((a, closing_a), (b, closing_b))))
         return approaches
 
@@ -142,13 +188,25 @@ class ProximityLimiter:
         return found[:_BOUNDED_PAIRS]
 
     def _closing_speeds(
-        self, data: mujoco.MjData, robot: int, geom: int, point: Floats, normal: Floats, joints: Floats
+        self,
+        data: mujoco.MjData,
+        robot: int,
+        geom: int,
+        point: Floats,
+        normal: Floats,
+        wanted: Floats,
+        motion: Motion | None,
     ) -> Floats:
         """Return the speed of a point along `normal` due to each joint, shape (n,); due to all, shape (1,)."""
         mujoco.mj_jac(self._model, data, self._jacobian, None, point, int(self._model.geom_bodyid[geom]))
         J = self._jacobian[:, self._dofs[robot]]
-        speeds: Floats = normal @ J * joints if self._config.proximity_per_joint else np.array([normal @ (J @ joints)])
-        return speeds
+        if motion is None and not self._config.proximity_per_joint:
+            return np.array([normal @ (J @ wanted)])
+        speeds: Floats = normal @ J * wanted
+        if motion is not None:
+            now = normal @ J * motion.now
+            speeds = np.maximum(np.maximum(speeds, normal @ J * motion.least), np.where(now > 0.0, now, -np.inf))
+        return speeds if self._config.proximity_per_joint else np.array([speeds.sum()])
 
 
 def _slow_approaches(approaches: Sequence[_Approach], factors: Sequence[Floats], share: bool = True) -> list[Floats]:

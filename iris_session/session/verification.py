@@ -39,6 +39,7 @@ class _RecordedControlConfig(ControlConfig, frozen=True):
     few_joints_orientation_cost: float | None = None
     target_grippers: bool = False
     proximity_per_joint: bool = False
+    proximity_stopped: bool = False
 
 
 #: Settings of control that recordings got later; what one of them does not name was off when it was made.

@@ -11,7 +11,7 @@ import pytest
 
 from anchors.pose import PoseTuple
 from iris_session.control import ControlConfig
-from iris_session.control.proximity import ProximityLimiter, compute_box_bounds
+from iris_session.control.proximity import Motion, ProximityLimiter, compute_box_bounds
 from iris_session.demo.scenes import scene_path
 from iris_session.physics import find_robots
 from iris_session.protocol.specs import RobotSpec
@@ -117,6 +117,61 @@ def test_an_arm_stretched_towards_another_comes_back_without_coming_nearer() -> 
     assert apart(jammed.tip(), home)[0] > 0.4, "recordings made before are verified with the law of then"
 
 
+def roam(seed: int, seconds: float, **settings: object) -> float:
+    """Both arms are sent to other random poses between them every 0.4 s; returns the smallest gap."""
+    rig, _ = make_handover(**settings)
+    rng, proximity, smallest = np.random.default_rng(seed), rig.controller._proximity, 1.0
+    goals: list[PoseTuple] = []
+    for k in range(round(seconds / rig.model.opt.timestep)):
+        if k % 100 == 0:
+            places = rng.uniform((-0.45, -0.4, 0.0), (0.45, 0.4, 0.7), (2, 3))
+            turns = rng.normal(size=(2, 4))
+            turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+            goals = [(tuple(p), tuple(q)) for p, q in zip(places.tolist(), turns.tolist(), strict=True)]
+        rows = [rig.source(*goal, absolute=True, device="target", new=k % 2 == 0) for goal in goals]
+        rig.step(decision(pose_command(robot.name, row) for robot, row in zip(rig.robots, rows, strict=True)))
+        smallest = min([smallest, *(pair[0] for pair in proximity._near_geoms(rig.data, 0, 1)[:1])])
+    return smallest
+
+
+def test_arms_at_full_speed_stop_apart() -> None:
+    assert roam(9, 8.0) > 0.02
+    assert roam(9, 8.0, proximity_stopped=False) < 0.0, "the law of earlier recordings lets servos run on"
+    # Brakes that take half a second: where the arms are commanded is not yet where they stop.
+    assert roam(2, 5.0, joint_acceleration=4.0, joint_velocity=3.0) > 0.05
+
+
+def test_two_arms_that_carry_something_between_them_stay_together() -> None:
+    model, robots = panda_arms([(0.0, 0.0, 0.0), (1.1, 0.0, 0.0)], [0.0, math.pi])
+    rig, apart_m = Rig(model, robots, home=PANDA_HOME), []
+    turns = [rig.tip(i)[1] for i in range(2)]
+    for k in range(2500):
+        x = 0.55 + (0.1 * math.sin(2.0 * math.pi * 0.7 * 0.002 * (k - 1000)) if k > 1000 else 0.0)
+        rows = [
+            rig.source((x + side, 0.0, 0.45), turn, absolute=True, device="target", new=k % 5 == 0)
+            for side, turn in zip((-0.055, 0.055), turns, strict=True)
+        ]
+        rig.step(decision(pose_command(robot.name, row) for robot, row in zip(robots, rows, strict=True)))
+        apart_m += [apart(rig.tip(0), rig.tip(1))[0]] * (k > 1000)
+    assert max(apart_m) - min(apart_m) < 0.005
+
+
+def test_samples_between_two_checks_do_not_lift_the_bound() -> None:
+    model, robots = panda_arms(*FACING)
+    rig, smallest = Rig(model, robots, home=PANDA_HOME), 1.0
+    rig.hold(5)
+    towards = np.array([0.0, 0.19, 0.0, 0.19, 0.0, 0.0, 0.0])
+    for k in range(1000):
+        # Leaders that retreat whenever they are looked at, and come nearer else.
+        step = towards if rig.controller._tick % 5 else -0.05 * np.sign(towards)
+        goals = rig.controller._joints.get_position(slice(None)).reshape(2, -1) + step
+        rows = [rig.source((0.0, 0.0, 0.0), pose_world=None, q=tuple(q), device="joints") for q in goals.tolist()]
+        rig.step(decision(Command(r.name, "joints", sources=(row,)) for r, row in zip(robots, rows, strict=True)))
+        if k % 5 == 0:
+            smallest = min([smallest, *(pair[0] for pair in rig.controller._proximity._near_geoms(rig.data, 0, 1)[:1])])
+    assert smallest > 0.05
+
+
 def test_no_pair_closes_faster_than_allowed_and_joints_that_open_all_of_them_are_not_slowed() -> None:
     model, robots = panda_arms([(0.0, 0.0, 0.0), (0.75, 0.0, 0.0), (0.4, 0.5, 0.0)], [0.0, math.pi, -math.pi / 2])
     rig, rng, slowed, kept = Rig(model, robots, home=PANDA_HOME), np.random.default_rng(2), 0, 0
@@ -125,7 +180,7 @@ def test_no_pair_closes_faster_than_allowed_and_joints_that_open_all_of_them_are
         rig.data.qpos[:] = home + rng.normal(0.0, 0.3, len(home))
         mujoco.mj_forward(model, rig.data)
         wanted = [rng.normal(0.0, 1.0, 7) for _ in robots]
-        factors = proximity.compute_speed_factors(rig.data, wanted)
+        factors = proximity.compute_speed_factors(rig.data, wanted).robots
         approaches = proximity._list_approaches(rig.data, wanted)
         for allowed, sides in approaches:
             assert sum(float(speeds @ factors[i]) for i, speeds in sides) <= allowed * (1.0 + 1e-6) + 1e-12
@@ -163,7 +218,7 @@ def factors(apart: float, va: float, vb: float, finger: float = 0.0) -> list[flo
     found = ProximityLimiter(model, robots, ControlConfig()).compute_speed_factors(
         data, [np.array([va]), np.array([vb]), np.array([0.0])]
     )
-    return [float(factor.item()) for factor in found]
+    return [float(factor.item()) for factor in found.robots]
 
 
 @pytest.mark.parametrize(
@@ -184,13 +239,32 @@ def test_closing_speed_is_bounded_by_distance(apart: float, va: float, vb: float
     assert factors(apart, va, vb)[:2] == pytest.approx(expected, abs=1e-9)
 
 
+def test_where_they_stop_counts_too_and_a_retreat_as_far_as_it_has_begun() -> None:
+    model, data, robots = sliders(0.4)
+    proximity = ProximityLimiter(model, robots, ControlConfig())
+    still, ahead = np.array([0.0]), np.array([1.0])
+
+    def slow(wanted_b: float, now_b: float, stop_a: float) -> list[float]:
+        b = [np.array([v]) for v in (wanted_b, now_b, float(np.clip(wanted_b, now_b - 0.1, now_b + 0.1)))]
+        motions = [Motion(ahead, ahead, ahead), Motion(*b), Motion(still, still, still)]
+        stops = np.array([stop_a, 0.0, 0.0])
+        found = proximity.compute_speed_factors(data, [ahead, b[0], still], motions, stops)
+        assert found.near == ({0, 1} if stop_a else frozenset())
+        return [float(factor.item()) for factor in found.robots[:2]]
+
+    assert slow(0.5, 0.5, 0.0) == [1.0, 1.0]
+    assert slow(0.5, 0.5, 0.15) == pytest.approx([0.62, 1.0])  # 5 cm apart when they stop
+    assert slow(0.5, 0.2, 0.15) == pytest.approx([0.42, 1.0])
+    assert slow(0.5, -0.2, 0.15) == pytest.approx([0.1, 0.1])
+
+
 def test_fingers_are_exempt() -> None:
     assert factors(0.6, 1.0, 0.0, finger=0.48) == [1.0, 1.0, 1.0]
     model, _, robots = sliders(0.6, 0.48)
     guarded = ProximityLimiter(model, [msgspec.structs.replace(r, finger_bodies=()) for r in robots], ControlConfig())
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    assert guarded.compute_speed_factors(data, [np.array([1.0]), np.array([0.0]), np.array([0.0])])[0] == [0.0]
+    assert guarded.compute_speed_factors(data, [np.array([1.0]), np.array([0.0]), np.array([0.0])]).robots[0] == [0.0]
 
 
 def test_nothing_to_check_for_one_robot_or_without_geoms() -> None:
@@ -230,7 +304,7 @@ def test_the_nearest_pair_cannot_hide_behind_49_others() -> None:
     assert len(proximity._geoms[0]) == 8
     towards = [np.array([0.4]), np.array([-0.4])]
     # 30 mm apart, 20 mm are kept: the closing speed is at most 4 * 10 mm/s of 0.8 m/s.
-    assert np.concatenate(proximity.compute_speed_factors(data, towards)) == pytest.approx([0.05, 0.05])
+    assert np.concatenate(proximity.compute_speed_factors(data, towards).robots) == pytest.approx([0.05, 0.05])
 
 
 def test_box_bounds_are_no_greater_than_the_distance() -> None:

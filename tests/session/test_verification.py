@@ -56,7 +56,7 @@ def test_a_recording_that_names_no_solver_was_made_with_mink(monkeypatch: pytest
         replay(header)
 
 
-@pytest.mark.parametrize("name", ["target_grippers", "proximity_per_joint"])
+@pytest.mark.parametrize("name", ["target_grippers", "proximity_per_joint", "proximity_stopped"])
 def test_what_a_recording_made_before_does_not_name_was_off(name: str) -> None:
     config = msgspec.msgpack.decode(header_of(make_core()).config)
     del config["control"][name]
