@@ -8,7 +8,14 @@ from contextlib import redirect_stdout
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from iris_session.cli.common import CommandError, ending_as_interrupts, list_first, make_number_type, print_result
+from iris_session.cli.common import (
+    CommandError,
+    ending_as_interrupts,
+    list_first,
+    make_number_type,
+    print_error,
+    print_result,
+)
 from iris_session.cli.progress import ProgressLine
 from iris_session.cli.recording_render import parse_size
 from iris_session.dataset.formats import FORMATS
@@ -24,12 +31,14 @@ OPTIONS: Final = (
 )
 DEFAULT_FPS: Final = 30
 DEFAULT_SIZE: Final = (640, 480)
+#: Options that say something about pictures.
+_OF_PICTURES: Final = ("size", "looks", "seed", "plain", "depth", "masks")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of data sets."""
     group = parser.add_argument_group("data sets (--to lerobot, robomimic or mcap)")
-    whole = make_number_type(int, "a rate: give a whole number of frames a second, for example 30", 1, 1000)
+    whole = make_number_type(int, "a rate: give 1 to 1000 frames a second, a whole number", 1, 1000)
     group.add_argument("--fps", type=whole, metavar="N", help="frames per second of simulated time (default: 30)")
     text = (
         "pictures of every frame: cameras of the model, streams of recorded pictures, NAME=CAMERA, or places "
@@ -72,6 +81,9 @@ def run(arguments: argparse.Namespace) -> int:
     width, height = arguments.size or DEFAULT_SIZE
     if width % 2 or height % 2:
         raise CommandError(f"--size {width}x{height}: a video needs even numbers")
+    of_pictures = [f"--{name}" for name in _OF_PICTURES if getattr(arguments, name)]
+    if of_pictures and not arguments.cameras:
+        raise CommandError(f"{of_pictures[0]} is about pictures, and there are none: name some by --cameras")
     if not FORMATS[arguments.to].has_layers and (arguments.depth or arguments.masks):
         there_are = " or ".join(name for name, one in FORMATS.items() if one.has_layers)
         raise CommandError(f"--to {arguments.to} has no depth and masks, its videos have 8 bits: --to {there_are}")
@@ -95,7 +107,12 @@ def run(arguments: argparse.Namespace) -> int:
         redirect_stdout(sys.stderr),  # of Ray, which tells of workers that died
     ):
         files = list_files(arguments.paths)
-        report = export_dataset(files, arguments.out, arguments.to, options, progress.show, open_pool)
+        try:
+            report = export_dataset(files, arguments.out, arguments.to, options, progress.show, open_pool)
+        except KeyboardInterrupt:
+            progress.end()
+            print_error(f"{arguments.out} is not finished: the same command goes on after its last closed episode")
+            raise
     n = f"{report.episodes:,} episode{'' if report.episodes == 1 else 's'}"
     lines = [f"{report.folder}: {n}, {report.frames:,} frames, {report.format}"]
     lines += [f"  {line}" for line in (*list_first(report.left_out), *list_first(report.notes))]

@@ -146,6 +146,8 @@ def describe_edit(one: ListedEpisode) -> Iterator[str]:
         yield f"{one.edit.trim[0]:g} to {one.edit.trim[1]:g} s"
     if not one.is_editable:
         yield "repeated"
+    if one.verdict == "running":
+        yield "(cut: unknown)"
 
 
 def _print_table(listed: ListedRecording) -> None:

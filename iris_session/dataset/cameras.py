@@ -94,13 +94,14 @@ def parse_camera(text: str) -> CameraSpec:
     """
     name, is_named, what = text.strip().partition("=")
     wrong = DatasetError(
-        f"{text!r:.80} is no camera: give a name of the model, NAME=CAMERA, or a place, NAME=X,Y,Z->X,Y,Z or with :FOVY"
+        f"{text!r:.80} is no camera: give a name of the model, NAME=CAMERA, or in quotes, as > is for the shell else, "
+        "a place, 'NAME=X,Y,Z->X,Y,Z' or with :FOVY from 1 to 170"
     )
     place = _PLACE.fullmatch(what.replace(" ", ""))
     if not _NAME.fullmatch(name.replace("/", "_")) or (is_named and not what):
         raise wrong
     if place is None:
-        if "->" in what:
+        if "->" in what or what.endswith("-"):
             raise wrong
         return CameraSpec(name.replace("/", "_"), what or name)
     x, y, z, tx, ty, tz, fovy = (float(number or 0.0) for number in place.groups())
@@ -139,7 +140,7 @@ def find_streams(pictures: PictureSpec, model: mujoco.MjModel, recording: Record
             raise DatasetError(
                 f"there is no camera {spec.camera!r} in the scene, and no recorded picture of it: give a camera of the "
                 f"scene ({cameras}), a stream of {recording.files[0]} ({streams}), or a place, "
-                f"{spec.name}=X,Y,Z->X,Y,Z:FOVY"
+                f"'{spec.name}=X,Y,Z->X,Y,Z:FOVY'"
             )
         try:
             width, height = read_stated_size(first.jpeg, AssetEncoding.JPEG)

@@ -281,7 +281,8 @@ def _read(path: Path) -> _Reading:
             raise DatasetError(f"{path} has no step: there is nothing to export")
         if recording.damage:
             raise DatasetError(
-                f"{path} is damaged ({recording.damage[0]}): `iris-session recording repair` writes what is left of it"
+                f"{path} is damaged ({recording.damage[0]}): `iris-session recording repair {path} -o FILE` writes "
+                "what is left of it"
             )
         steps, first = np.unique(np.concatenate([row.steps for row in rows]), return_index=True)
         times = RowTimes(steps, np.concatenate([row.session_times for row in rows])[first])

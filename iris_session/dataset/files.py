@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import shutil
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +27,8 @@ Stats = dict[str, NDArray[np.float64]]
 
 #: Files that are not in their places yet.
 PARTIAL: Final = ".partial"
+#: Recordings that an error names.
+_NAMED: Final = 3
 
 
 class PictureSink(ABC):
@@ -74,7 +79,7 @@ class SetWriter(ABC):
             name: File of the request in the folder.
             request: All that the set follows from, as plain values: that of a set that is there must be the same.
         """
-        check_folder(self.folder, name, request)
+        check_folder(self.folder, name, request, {one.id: Path(one.path).name for one in self.plan.recordings})
         shutil.rmtree(self.partial, ignore_errors=True)
         self.partial.mkdir(parents=True, exist_ok=True)
 
@@ -132,17 +137,39 @@ class SetWriter(ABC):
         sync_folder(target.parent)
 
 
-def check_folder(folder: Path, name: str, request: Mapping[str, Any]) -> None:
-    """Check that a folder is empty, does not exist, or has an unfinished or finished set of the same request.
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Make a folder and let no other export use it meanwhile (on file systems with locks).
+
+    Raises:
+        DatasetError: Another one does.
+        OSError: It cannot be made.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise DatasetError(f"{folder} is no folder: give one that is empty or does not exist")
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EAGAIN, errno.EACCES):
+            os.close(descriptor)
+            raise DatasetError(f"another export writes to {folder}: wait for its end, or give another folder") from None
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def check_folder(folder: Path, name: str, request: Mapping[str, Any], files: Mapping[str, str]) -> None:
+    """Check that a folder is empty, or has an unfinished or finished set of the same request.
+
+    `files`: names of the recordings of the request, by their ids.
 
     Raises:
         DatasetError: It has something else.
     """
     path = folder / name
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise DatasetError(f"{folder} is no folder: give one that is empty or does not exist")
     if not path.exists():
         # Folders without files are of a run that was killed at its beginning.
         if any(one.is_file() for one in folder.rglob("*") if PARTIAL not in one.parts):
@@ -155,10 +182,16 @@ def check_folder(folder: Path, name: str, request: Mapping[str, Any]) -> None:
         assert isinstance(found, dict)
     except (ValueError, AssertionError) as error:
         raise DatasetError(f"{path} is damaged: give another folder") from error
+    if new := set(request.get("recordings", ())) - set(found.get("recordings", ())):
+        names = ", ".join(sorted(files[one] for one in new)[:_NAMED])
+        raise DatasetError(
+            f"{folder} has a data set without {len(new)} of the recordings: {names}. Give those of the set, or another "
+            "folder"
+        )
     if difference := _find_difference(found, json.loads(json.dumps(request))):
         where, there, here = difference
         raise DatasetError(
-            f"{folder} has a data set with another {where} ({there}, not {here}): give another folder, or remove it"
+            f"{folder} has a data set that differs in {where} ({there}, not {here}): give another folder, or remove it"
         )
 
 

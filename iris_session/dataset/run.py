@@ -36,7 +36,7 @@ from iris_session.dataset.episodes import (
     identify_recording,
     make_plan,
 )
-from iris_session.dataset.files import PARTIAL, PictureSink, Stats
+from iris_session.dataset.files import PARTIAL, PictureSink, Stats, lock_folder
 from iris_session.dataset.formats import FORMATS, MODEL, make_sink, open_writer
 from iris_session.dataset.frames import (
     SESSION_TIME,
@@ -279,7 +279,8 @@ def export_dataset(
     schema, options = _find_schema(plan, options)
     request = _make_request(to, plan, schema, options)
     try:
-        return _write(folder, to, plan, schema, options, request, say, open_pool)
+        with lock_folder(folder):
+            return _write(folder, to, plan, schema, options, request, say, open_pool)
     except OSError as error:
         shutil.rmtree(folder / PARTIAL, ignore_errors=True)  # on a full disk others need the place
         reason = " ".join((error.strerror or str(error)).split())

@@ -153,7 +153,7 @@ def test_cameras_are_parsed() -> None:
 )
 def test_what_is_no_camera_is_refused(text: str) -> None:
     with pytest.raises(
-        DatasetError, match=r"is no camera: give a name of the model, NAME=CAMERA, or a place|looks at where"
+        DatasetError, match=r"is no camera: give a name of the model, NAME=CAMERA, or in quotes|looks at where"
     ):
         parse_cameras(text)
 

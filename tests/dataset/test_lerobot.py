@@ -15,6 +15,7 @@ from pyarrow import parquet
 from iris_session.cli.main import main
 from iris_session.dataset.cameras import PictureSpec, parse_cameras
 from iris_session.dataset.episodes import DatasetError, PlanOptions
+from iris_session.dataset.files import lock_folder
 from iris_session.dataset.lerobot import LeRobotWriter
 from iris_session.dataset.run import DatasetOptions, export_dataset
 from iris_session.system.process import child_environment, module_command
@@ -125,10 +126,17 @@ def test_a_finished_set_is_left_as_it_is(played: Played, tmp_path: Path) -> None
 def test_other_folders_are_refused(played: Played, tmp_path: Path) -> None:
     folder = tmp_path / "set"
     export_dataset([played.path], folder, "lerobot", DatasetOptions(50))
-    with pytest.raises(DatasetError, match=r"has a data set with another fps \(50, not 25\)"):
+    with pytest.raises(DatasetError, match=r"has a data set that differs in fps \(50, not 25\)"):
         export_dataset([played.path], folder, "lerobot", DatasetOptions(25))
-    with pytest.raises(DatasetError, match=r"with another pictures.looks \(0, not 2\)"):
+    with pytest.raises(DatasetError, match=r"differs in pictures.looks \(0, not 2\)"):
         export_dataset([played.path], folder, "lerobot", DatasetOptions(50, PictureSpec(looks=2)))
+    record(tmp_path / "later.rrd", recording_class="open")
+    with pytest.raises(DatasetError, match=r"a data set without 1 of the recordings: later\.rrd"):
+        export_dataset([played.path, tmp_path / "later.rrd"], folder, "lerobot", DatasetOptions(50))
+    before = read_files(folder)
+    with lock_folder(folder), pytest.raises(DatasetError, match="another export writes to"):
+        export_dataset([played.path], folder, "lerobot", DatasetOptions(50))
+    assert read_files(folder) == before
     with pytest.raises(DatasetError, match="is not empty, and has no data set of this format"):
         export_dataset([played.path], played.path.parent, "lerobot", DatasetOptions(25))
     with pytest.raises(DatasetError, match="is no folder"):
@@ -175,6 +183,8 @@ def test_command(played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[s
         (["--size", "33x64", "--cameras", "side"], "a video needs even numbers"),
         (["--hz", "30"], "--hz are for tables"),
         (["--cameras", "nope"], "there is no camera 'nope'"),
+        (["--cameras", "top=0,0,2.4-"], "in quotes"),  # what the shell leaves of `0,0,2.4->0,0,0.7`
+        (["--looks", "2"], "--looks is about pictures"),
         (["--fps", "501"], "more than the 500 ticks a second"),
     ):
         assert main([*command[:-1], str(tmp_path / "other"), *wrong]) == 2
