@@ -172,7 +172,7 @@ def _read_usage(session: Session, *, anew: bool) -> _Reading:
     processes = session.processes
     pids = {
         "server": (os.getpid(), processes.front_pid),
-        "recorder": (processes.recorder_pid,),
+        "recorder": (0 if processes.recorder is None else processes.recorder.pid,),
         "gateway": (0 if processes.web is None else processes.web.pid,),
     }
     found = {}

@@ -460,7 +460,8 @@ class RecordedSession(Plugin):
 
         before = self._known
         self._session.run(seconds=timeout_s, until=is_written)
-        return self._session.processes.recorder_pid if self._known != before else 0, self._session.origin_ns
+        recorder = self._session.processes.recorder
+        return recorder.pid if recorder and self._known != before else 0, self._session.origin_ns
 
     def close(self) -> None:
         """Close the session."""

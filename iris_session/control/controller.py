@@ -529,9 +529,9 @@ class Controller:
             motions, stops = None, None
             if self._config.proximity_stopped:
                 change = joints.acceleration * (self._check_ticks * self._dt)
-                least = np.clip(wanted, joints.v - change, joints.v + change)
-                motions = [Motion(wanted[c], joints.v[c], least[c]) for c in self._columns]
-                stops = self._find_stops(data, least)
+                reached = np.clip(wanted, joints.v - change, joints.v + change)
+                motions = [Motion(joints.v[c], reached[c]) for c in self._columns]
+                stops = self._find_stops(data, reached)
             speeds = [wanted[columns] for columns in self._columns]
             factors, near = self._proximity.compute_speed_factors(data, speeds, motions, stops)
         for i, (r, factor) in enumerate(zip(self._states, factors, strict=True)):
@@ -540,7 +540,7 @@ class Controller:
             # Near another robot no joint gets faster than it wants to be now, or turns round, whatever the next sample
             # wants.
             if joints.one_way:
-                joints.near[columns] = wanted[columns] * factor if i in near else np.inf
+                joints.near[columns] = wanted[columns] * factor if i in near and r.latch else np.inf
             else:
                 joints.near[columns] = speed[columns] if r.proximity == 1.0 else np.abs(wanted[columns]) * factor
 

@@ -48,15 +48,14 @@ class _Approach(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Joint velocities of one robot until the next check, shape (n,) each [rad/s].
+    """Joint velocities of one robot besides those that it wants, shape (n,) each [rad/s].
 
-    `wanted`: towards the goal. `now`: as they are: a joint that approaches counts, although it wants to retreat, as the
-    next sample may want something else. `least`: as near to `wanted` as they can come: no joint retreats faster.
+    `now`: as they are: a joint that approaches counts, although it wants to retreat, as the next sample may want
+    something else. `next`: as near to the wanted ones as they can be at the next check: no joint retreats faster.
     """
 
-    wanted: Floats
     now: Floats
-    least: Floats
+    next: Floats
 
 
 class SpeedFactors(NamedTuple):
@@ -100,7 +99,7 @@ class ProximityLimiter:
     ) -> SpeedFactors:
         """Return by which factors robots are slowed.
 
-        `wanted`: joint velocities [rad/s] each robot would take, (n_i,). `motions`: those and others. `stops`: `qpos`
+        `wanted`: joint velocities [rad/s] each robot would take, (n_i,). `motions`: others. `stops`: `qpos`
         where the robots come to a stop if they brake at the next check, shape (nq,). Without these two it is the law of
         earlier recordings.
         """
@@ -136,8 +135,9 @@ class ProximityLimiter:
                 # Points of penetrating geoms are swapped: the direction from a to b stays the same.
                 normal = gap / math.copysign(max(float(np.linalg.norm(gap)), 1e-9), distance)
                 allowed = max(0.0, self._config.proximity_gain * (distance - self._config.proximity_stop))
-                closing_a = self._closing_speeds(data, a, geom_a, p_a, normal, wanted[a], motions and motions[a])
-                closing_b = self._closing_speeds(data, b, geom_b, p_b, -normal, wanted[b], motions and motions[b])
+                motion_a, motion_b = (motions[a], motions[b]) if motions else (None, None)
+                closing_a = self._closing_speeds(data, a, geom_a, p_a, normal, wanted[a], motion_a)
+                closing_b = self._closing_speeds(data, b, geom_b, p_b, -normal, wanted[b], motion_b)
                 approaches.append(_Approach(allowed, ((a, closing_a), (b, closing_b))))
         return approaches
 
@@ -205,7 +205,7 @@ class ProximityLimiter:
         speeds: Floats = normal @ J * wanted
         if motion is not None:
             now = normal @ J * motion.now
-            speeds = np.maximum(np.maximum(speeds, normal @ J * motion.least), np.where(now > 0.0, now, -np.inf))
+            speeds = np.maximum(np.maximum(speeds, normal @ J * motion.next), np.where(now > 0.0, now, -np.inf))
         return speeds if self._config.proximity_per_joint else np.array([speeds.sum()])
 
 

@@ -245,10 +245,10 @@ def test_where_they_stop_counts_too_and_a_retreat_as_far_as_it_has_begun() -> No
     still, ahead = np.array([0.0]), np.array([1.0])
 
     def slow(wanted_b: float, now_b: float, stop_a: float) -> list[float]:
-        b = [np.array([v]) for v in (wanted_b, now_b, float(np.clip(wanted_b, now_b - 0.1, now_b + 0.1)))]
-        motions = [Motion(ahead, ahead, ahead), Motion(*b), Motion(still, still, still)]
+        b = [np.array([v]) for v in (now_b, float(np.clip(wanted_b, now_b - 0.1, now_b + 0.1)))]
+        motions = [Motion(ahead, ahead), Motion(*b), Motion(still, still)]
         stops = np.array([stop_a, 0.0, 0.0])
-        found = proximity.compute_speed_factors(data, [ahead, b[0], still], motions, stops)
+        found = proximity.compute_speed_factors(data, [ahead, np.array([wanted_b]), still], motions, stops)
         assert found.near == ({0, 1} if stop_a else frozenset())
         return [float(factor.item()) for factor in found.robots[:2]]
 
