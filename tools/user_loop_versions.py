@@ -123,7 +123,7 @@ def is_slowed(model: Any) -> bool:
     mujoco.mj_forward(model, data)
     limiter, swing = ProximityLimiter(model, find_robots(model).robots, ControlConfig()), np.eye(6)[2]
     closing, opening = (
-        [factors.min() for factors in limiter.compute_speed_factors(data, [way * swing, way * swing])]
+        [factors.min() for factors in limiter.compute_speed_factors(data, [way * swing, way * swing]).robots]
         for way in (-1.0, 1.0)
     )
     return bool(max(closing) < 1.0 == min(opening))
