@@ -211,8 +211,8 @@ class Joiner(Plugin):
                 np.copyto(target, source)
 
         with ThreadPoolExecutor(COPY_THREADS) as pool:
-            for _ in range(COPY_THREADS):
-                pool.submit(copy_until_end)
+            for copying in [pool.submit(copy_until_end) for _ in range(COPY_THREADS)]:
+                copying.result()
         return begin_ns - origin_ns, end_ns - origin_ns
 
     def transfer_in_bulk(self, port: int) -> float:

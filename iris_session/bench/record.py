@@ -292,7 +292,10 @@ def kill_session(path: Path, seed: int, kinds: Sequence[str], random_of: random.
             time.sleep(random_of.uniform(0.5, 1.0))  # until any moment between two writes
             now_ns = time.monotonic_ns()
             for pid in {RECORDER: [recorder], AUTHORITY: [session.pid], BOTH: [recorder, session.pid]}[kind]:
-                os.kill(pid, signal.SIGKILL)
+                try:
+                    os.kill(pid, signal.SIGKILL)
+                except ProcessLookupError:
+                    raise BenchError("a process ended before it was killed") from None
             killed.append((kind, now_ns - origin_ns))
     finally:
         with suppress(psutil.Error):

@@ -135,6 +135,17 @@ def register(commands: Commands) -> None:
         help="run a benchmark and compare it with its bars",
         description="Measure with separate client processes. With --check, exit status 1 if a bar is missed. "
         "`iris-session bench NAME --help` has the options of one.",
+        examples="""
+            iris-session bench state --check
+            iris-session bench state --curve --json
+            iris-session bench input --operators 4 --robots 4 --seconds 10
+            iris-session bench state --profile busy-wifi
+            iris-session bench alignment --worlds W1,mixes --headsets 100 --json
+            iris-session bench cloud --beside --check
+            iris-session bench cloud-stream --points 50000 --hz 60 --check
+            iris-session bench record --seconds 20 --kills 4
+            iris-session bench web --clients 8 --curve --check
+        """,
     )
     for name, (text, options) in BENCHMARKS.items():
         parser = add_command(

@@ -29,7 +29,6 @@ from iris_session.cli.common import (
     print_json,
     print_result,
     to_printable,
-    write_file,
 )
 from iris_session.protocol.errors import IrisError
 from iris_session.protocol.names import MediaEncoding, Role
@@ -226,9 +225,13 @@ def run_example(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         sys.stdout.write(text)
         return 0
-    if arguments.out.exists():
-        raise CommandError(f"{arguments.out} exists: give another file, or remove it first")
-    write_file(arguments.out, text)
+    try:
+        with arguments.out.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise CommandError(f"{arguments.out} exists: give another file, or remove it first") from None
+    except OSError as error:
+        raise CommandError(f"{arguments.out} cannot be written: {error.strerror}") from None
     print(f"{arguments.out}: edit it, then `iris-session cloud inspect {arguments.out}`")
     return 0
 

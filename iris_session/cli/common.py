@@ -10,6 +10,7 @@ import re
 import signal
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
@@ -92,6 +93,9 @@ def make_number_type(kind: Callable[[str], N], wanted: str, low: float, high: fl
     return parse
 
 
+#: Timeout of the test whether a session is reachable [s].
+CONNECT_S: Final = 2.0
+
 #: Types of options: a duration [s], ports, and `--port-base`.
 parse_seconds: Final = make_number_type(float, "a duration: give seconds above 0, for example 30", ABOVE_0)
 parse_port: Final = make_number_type(int, "a port: give 1 to 65535", 1, 65535)
@@ -131,7 +135,7 @@ class CommandParser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **options)
-        self._negative_number_matcher = re.compile(r"-[0-9.][^,]*(,.*)?")  # a pose that begins with a minus, too
+        self._negative_number_matcher = re.compile(r"-[0-9.]")  # a pose that begins with a minus, too
 
     def list_examples(self) -> Sequence[str]:
         """Return the examples of its help."""
@@ -186,10 +190,12 @@ def add_command(
 
 
 def add_actions(
-    commands: Commands, name: str, *, help: str, description: str = "", metavar: str = "ACTION"
+    commands: Commands, name: str, *, help: str, description: str = "", examples: str = "", metavar: str = "ACTION"
 ) -> Commands:
-    """Add a command that has actions, and return them. `help`, `description`: as of `add_command`."""
+    """Add a command that has actions, and return them. `help`, `description`, `examples`: as of `add_command`; the
+    default is the first example of each action."""
     parser = _add_parser(commands, name, help, description)
+    parser.examples = inspect.cleandoc(examples).split("\n") if examples else ()
     return parser.add_subparsers(dest="action", required=True, metavar=metavar)
 
 
@@ -218,15 +224,23 @@ def add_address_options(
 
 
 def check_session_reachable(arguments: argparse.Namespace) -> None:
-    """Raise `CommandError` if nothing listens at the given address: a client would wait for the session to start."""
-    from iris_session.client.discovery import Address
+    """Raise `CommandError` within `CONNECT_S` if nothing listens at the given address: a client would wait for it."""
+    from iris_session.client.discovery import Address, resolve_host
     from iris_session.client.endpoint_resolver import LOCAL_ADDRESS
 
     if arguments.session:  # found by its name, it has no address yet
         return
     address = Address.parse(arguments.address or LOCAL_ADDRESS)
+    until_s = time.monotonic() + CONNECT_S
+    resolving = resolve_host(address.host, until_s)  # an e-stop does not wait for a name server
     try:
-        socket.create_connection((address.host, address.port), 2.0).close()  # [s]
+        while True:
+            try:
+                next(resolving)
+            except StopIteration as found:
+                socket.create_connection((found.value, address.port), max(0.1, until_s - time.monotonic())).close()
+                return
+            time.sleep(0.005)
     except OSError as error:
         raise CommandError(
             f"no session answers at {address}: is `iris-session serve` running there? "
@@ -246,9 +260,14 @@ def make_client(arguments: argparse.Namespace, role: str, name: str) -> Client:
     )
 
 
+def is_given(value: object) -> bool:
+    """Return whether an option was given, by its value: 0 is one."""
+    return value is not None and value is not False and value not in ("", [])
+
+
 def refuse_options(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
     """Raise `CommandError` if some of these options are given: their list, then `why`."""
-    given = ", ".join(f"--{name}" for name in names if getattr(arguments, name))
+    given = ", ".join(f"--{name}" for name in names if is_given(getattr(arguments, name)))
     if given:
         raise CommandError(f"{given}{why}")
 

@@ -40,12 +40,40 @@ _MODULES = (
 )  # fmt: skip
 
 
+#: Of the whole command line.
+_EXAMPLES = """\
+iris-session demo handover                 two emulated operators hand over a hammer
+iris-session serve scene.xml               share a MuJoCo scene on this machine
+iris-session pair                          a join code and a QR code for one new device
+iris-session pair --web                    a link and a QR code for one browser
+iris-session web 192.168.0.10              a page here for a session on another machine
+iris-session keys list                     the keys that may join
+iris-session sessions                      the sessions on this network
+iris-session robots scene.xml              the robots found in a model, as TOML to edit
+iris-session scene inspect scene.xml       what clients receive of a scene, and what is heavy
+iris-session anchors print --size 150mm    a sheet for headsets and cameras, as PDF
+iris-session cloud example                 a file for depth cameras; inspect it, or run it in a session
+iris-session emulate --behaviour wander    one emulated headset joins the session on this machine
+iris-session policy --repo PATH --robot left    a trained policy of LeRobot drives a robot, beside people
+iris-session status --watch                participants, robots, ages, late ticks, recorder of a session
+iris-session estop                         stop every robot of the session; clear-estop, pause, assign, ... as well
+iris-session doctor 192.168.1.20           what is wrong, why, and what to do
+iris-session view                          the newest recording in Rerun's viewer
+iris-session verify sessions/*/session.rrd re-simulate a recording and compare it bit for bit
+iris-session recording inspect sessions    what recordings hold: who, what, how long, damage
+iris-session export sessions --to lerobot --out set    a data set for training, of all successful episodes
+iris-session recording export session.rrd --to csv -o tables
+iris-session recording render session.rrd -o session.mp4
+iris-session bench state --check           measure the state stream and compare it with its bars"""
+
+
 def build_parser() -> CommandParser:
     """Return the parser of the whole command line."""
     parser = CommandParser(
         prog="iris-session",
         description="Share one robot scene between several people in XR headsets.",
     )
+    parser.examples = _EXAMPLES.split("\n")
     parser.add_argument("--version", action="version", version=f"iris-session {version('iris-session')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in _MODULES:

@@ -6,11 +6,12 @@ import argparse
 import sys
 from contextlib import redirect_stdout
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from iris_session.cli.common import (
     CommandError,
     ending_as_interrupts,
+    is_given,
     list_first,
     make_number_type,
     print_error,
@@ -19,9 +20,6 @@ from iris_session.cli.common import (
 from iris_session.cli.progress import ProgressLine
 from iris_session.cli.recording_render import parse_size
 from iris_session.dataset.formats import FORMATS
-
-if TYPE_CHECKING:
-    pass
 
 LABELS: Final = ("success", "failure", "unknown")
 #: Options that only data sets have.
@@ -81,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     width, height = arguments.size or DEFAULT_SIZE
     if width % 2 or height % 2:
         raise CommandError(f"--size {width}x{height}: a video needs even numbers")
-    of_pictures = [f"--{name}" for name in _OF_PICTURES if getattr(arguments, name)]
+    of_pictures = [f"--{name}" for name in _OF_PICTURES if is_given(getattr(arguments, name))]
     if of_pictures and not arguments.cameras:
         raise CommandError(f"{of_pictures[0]} is about pictures, and there are none: name some by --cameras")
     if not FORMATS[arguments.to].has_layers and (arguments.depth or arguments.masks):
@@ -111,7 +109,8 @@ def run(arguments: argparse.Namespace) -> int:
             report = export_dataset(files, arguments.out, arguments.to, options, progress.show, open_pool)
         except KeyboardInterrupt:
             progress.end()
-            print_error(f"{arguments.out} is not finished: the same command goes on after its last closed episode")
+            if arguments.out.exists():
+                print_error(f"{arguments.out} is not finished: the same command goes on after its last closed episode")
             raise
     n = f"{report.episodes:,} episode{'' if report.episodes == 1 else 's'}"
     lines = [f"{report.folder}: {n}, {report.frames:,} frames, {report.format}"]

@@ -357,6 +357,8 @@ class Controller:
         r.latch = r.pending = None
         r.fresh = r.want_solve = r.ramping = False
         r.proximity, r.solver_limits = 1.0, ()
+        if self._joints.one_way:
+            self._joints.near[self._columns[i]] = np.inf  # it brakes as hard as it can
         self._grippers.stop(i)
         if self._writes_ctrl:
             self._joints.stop(self._columns[i])
@@ -537,8 +539,8 @@ class Controller:
         for i, (r, factor) in enumerate(zip(self._states, factors, strict=True)):
             columns = self._columns[i]
             r.proximity = 1.0 if r.latch is None else float(factor.min())
-            # Near another robot no joint gets faster than it wants to be now, or turns round, whatever the next sample
-            # wants.
+            # Near another robot no joint that moves gets faster than it wants to be now, or turns round, until the next
+            # check, whatever the next sample wants.
             if joints.one_way:
                 joints.near[columns] = wanted[columns] * factor if i in near and r.latch else np.inf
             else:
@@ -548,7 +550,8 @@ class Controller:
         """Return `qpos`, shape (nq,), where joints come to a stop that brake from the next check on, with the speeds
         `v` by then, shape (n,); what is not driven and does not brake is where it is measured."""
         joints, stops = self._joints, np.array(data.qpos)
-        travel = v * (self._check_ticks * self._dt) + np.sign(v) * joints.find_stop_distance(v)
+        until_then = np.where(joints.v * v > 0.0, np.maximum(np.abs(v), np.abs(joints.v)), np.abs(v))
+        travel = np.sign(v) * (until_then * (self._check_ticks * self._dt) + joints.find_stop_distance(v))
         moves = self._latched | (joints.v != 0.0)
         stops[self._qpos[moves]] = (joints.get_position(slice(None)) + travel)[moves]
         return stops

@@ -7,7 +7,8 @@ them that no later command takes back. Each bounds the speed.
 Distances are measured on the whole scene between the robots' geoms, finger bodies exempt: grippers must meet to hand
 objects over. Broad phase: boxes around each robot's geoms; then bounding spheres; then `mj_geomDistance` for the
 nearest pairs. Where many bounding spheres overlap (long links), oriented boxes bound the distances, and the nearest
-pair of all is always measured. Only motion that closes the gap is slowed; motion that opens it never is.
+pair of all is always measured. Only motion that closes the gap is slowed; a joint that turns round to open it waits for
+the next check.
 """
 
 from __future__ import annotations

@@ -134,11 +134,17 @@ def list_files(given: Sequence[Path], on_error: Callable[[OSError], None] = refu
         DatasetError: Something does not exist, or a folder has no recording.
     """
     files: dict[str, Path] = {}
+    unread: list[str] = []
+
+    def note(error: OSError) -> None:
+        unread.append(str(error.filename))
+        on_error(error)
+
     for path in given:
         if not os.path.exists(path):
             raise DatasetError(f"{path} does not exist: give a recording (session.rrd), or a folder with recordings")
-        found = find_recordings(path, on_error) if path.is_dir() else [path]
-        if not found:
+        found = find_recordings(path, note) if path.is_dir() else [path]
+        if not found and not unread:
             raise DatasetError(f"there is no recording below the folder {path}: give one with .rrd files")
         files |= {os.path.realpath(one): one for one in found}
     return list(files.values())

@@ -79,7 +79,7 @@ class SetWriter(ABC):
             name: File of the request in the folder.
             request: All that the set follows from, as plain values: that of a set that is there must be the same.
         """
-        check_folder(self.folder, name, request, {one.id: Path(one.path).name for one in self.plan.recordings})
+        check_folder(self.folder, name, request, {one.id: str(one.path) for one in self.plan.recordings})
         shutil.rmtree(self.partial, ignore_errors=True)
         self.partial.mkdir(parents=True, exist_ok=True)
 
@@ -164,7 +164,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
 def check_folder(folder: Path, name: str, request: Mapping[str, Any], files: Mapping[str, str]) -> None:
     """Check that a folder is empty, or has an unfinished or finished set of the same request.
 
-    `files`: names of the recordings of the request, by their ids.
+    `files`: recordings of the request, by their ids.
 
     Raises:
         DatasetError: It has something else.

@@ -280,9 +280,12 @@ def export_dataset(
     request = _make_request(to, plan, schema, options)
     try:
         with lock_folder(folder):
-            return _write(folder, to, plan, schema, options, request, say, open_pool)
+            try:
+                return _write(folder, to, plan, schema, options, request, say, open_pool)
+            except OSError:
+                shutil.rmtree(folder / PARTIAL, ignore_errors=True)  # on a full disk others need the place
+                raise
     except OSError as error:
-        shutil.rmtree(folder / PARTIAL, ignore_errors=True)  # on a full disk others need the place
         reason = " ".join((error.strerror or str(error)).split())
         raise DatasetError(f"the data set cannot be written to {folder}: {reason}") from error
 

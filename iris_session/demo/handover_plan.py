@@ -179,7 +179,7 @@ class _Planner:
         takes: dict[PoseTuple, Floats | None] = {}
         gives: dict[tuple[int, PoseTuple], Floats | None] = {}
         offers: dict[tuple[int, PoseTuple], list[Floats] | None] = {}
-        (give, take), scene = self._names, self._scene
+        (give, take), scene, weak = self._names, self._scene, ""
         for meeting in self._list_meetings(given)[:MAX_MEETINGS]:
             at, key = meeting.T_world_object, (id(meeting.given), meeting.T_world_object)
             T_take = compose(at, self._to_tip(take, meeting.taken))
@@ -198,10 +198,13 @@ class _Planner:
                 offers[key] = self._follow_offer(meeting)
             offer = offers[key]
             if offer is not None and self._check_exchange(meeting, offer):
-                for name, q in ((give, meeting.given.q), (give, q_give), (take, q_take)):
-                    if weak := scene.find_weak_motor(name, q):
-                        raise ConfigError(weak)
-                return self._make_plan(meeting)
+                postures = (give, meeting.given.q), (give, q_give), (take, q_take)
+                found = next(filter(None, (scene.find_weak_motor(name, q) for name, q in postures)), "")
+                if not found:
+                    return self._make_plan(meeting)
+                weak = weak or found
+        if weak:
+            raise ConfigError(weak)
         clash = f", or come too close ({self._clash})" if self._clash else ""
         apart = distance(self._giver.T_world_root[0], self._receiver.T_world_root[0])
         causes = "".join(self._explain(name) for name in self._names)

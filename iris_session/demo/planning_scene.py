@@ -247,9 +247,12 @@ class PlanningScene:
         mujoco.mj_forward(model, data)
         for joint, actuator in zip(arm.chain.joint_ids, arm.spec.actuators, strict=True):
             a, dof = find_element_id(model, "actuator", actuator), model.jnt_dofadr[joint]
-            most = abs(model.actuator_gainprm[a, 0]) * np.abs(model.actuator_ctrlrange[a]).max()
-            needed = abs(data.qfrc_bias[dof] - data.qfrc_gravcomp[dof]) / abs(model.actuator_gear[a, 0])
-            if _is_motor(model, a) and model.actuator_ctrllimited[a] and most < needed:
+            if not (_is_motor(model, a) and model.actuator_ctrllimited[a]):
+                continue
+            gain = abs(model.actuator_gainprm[a, 0] * model.actuator_gear[a, 0])
+            most = gain * np.abs(model.actuator_ctrlrange[a]).max()
+            needed = abs(data.qfrc_bias[dof] - data.qfrc_gravcomp[dof])
+            if most < needed:
                 unit = "N" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else "N m"
                 takes = f"holding '{name}' on its way takes {needed:.2g} {unit}"
                 return f"motor '{actuator}' has {most:.2g} {unit}, but {takes}"

@@ -103,9 +103,7 @@ class PendingInputs:
         if is_full and isinstance(message, EStop) and any(isinstance(one, EStop) for one in self.messages.copy()):
             return  # an e-stop waits already
         if is_full and not isinstance(message, EStop):
-            raise OwnershipError(
-                f"queue of inputs full ({MAX_HOST_ENTRIES} wait for one step): is the loop running? Call run() first"
-            )
+            raise OwnershipError(f"queue of inputs full ({MAX_HOST_ENTRIES} wait for one step): is the loop running?")
         self.post_own(message)
 
     def post_own(self, message: EntryMessage) -> None:

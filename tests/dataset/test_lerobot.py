@@ -131,7 +131,7 @@ def test_other_folders_are_refused(played: Played, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"differs in pictures.looks \(0, not 2\)"):
         export_dataset([played.path], folder, "lerobot", DatasetOptions(50, PictureSpec(looks=2)))
     record(tmp_path / "later.rrd", recording_class="open")
-    with pytest.raises(DatasetError, match=r"a data set without 1 of the recordings: later\.rrd"):
+    with pytest.raises(DatasetError, match=r"a data set without 1 of the recordings: .*later\.rrd"):
         export_dataset([played.path, tmp_path / "later.rrd"], folder, "lerobot", DatasetOptions(50))
     before = read_files(folder)
     with lock_folder(folder), pytest.raises(DatasetError, match="another export writes to"):
