@@ -53,7 +53,7 @@ def register(actions: Commands) -> None:
             iris-session recording export session.rrd --to assets -o scene-files
         """,
     )
-    text = "a .rrd or folder; for a data set several"
+    text = "recordings (.rrd) and folders of them for a data set; one recording for tables and assets"
     parser.add_argument("paths", type=Path, nargs="+", metavar="RECORDING", help=text)
     formats = (*DATASETS, *FORMATS, ASSETS)
     parser.add_argument("--to", required=True, choices=formats, help="format of the data set or tables, or assets")
