@@ -336,7 +336,7 @@ def test_an_export_that_ends_leaves_no_process(
     output, errors = process.communicate()
     assert process.returncode == (130 if number == signal.SIGINT else -number)
     assert output == ""
-    assert without_progress(errors) == []
+    assert len(without_progress(errors)) == (number == signal.SIGINT)  # how to go on
     assert len(processes) > 3
     # After SIGKILL, Ray's own agents notice within a minute.
     assert psutil.wait_procs(processes, timeout=300)[1] == []
