@@ -100,9 +100,9 @@ class ProximityLimiter:
     ) -> SpeedFactors:
         """Return by which factors robots are slowed.
 
-        `wanted`: joint velocities [rad/s] each robot would take, (n_i,). `motions`: how each moves until the next check.
-        `stops`: `qpos` where the robots come to a stop if they brake then, shape (nq,). Without these two it is the law
-        of earlier recordings.
+        `wanted`: joint velocities [rad/s] each robot would take, (n_i,). `motions`: how each moves meanwhile. `stops`:
+        `qpos` where the robots come to a stop if they brake at the next check, shape (nq,). Without these two it is the
+        law of earlier recordings.
         """
         per_joint = self._config.proximity_per_joint
         factors = [np.ones(len(joints) if per_joint else 1) for joints in wanted]
