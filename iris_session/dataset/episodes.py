@@ -141,6 +141,7 @@ def list_files(given: Sequence[Path], on_error: Callable[[OSError], None] = refu
         on_error(error)
 
     for path in given:
+        unread.clear()
         if not os.path.exists(path):
             raise DatasetError(f"{path} does not exist: give a recording (session.rrd), or a folder with recordings")
         found = find_recordings(path, note) if path.is_dir() else [path]

@@ -52,10 +52,10 @@ from iris_session.replay.simulation import Replay
 from iris_session.session.core import SessionCore
 from iris_session.system.process import die_with_parent, is_parent
 
-#: Packages whose version changes the bytes of a set, beside those of its format.
 #: Of the bytes that the same recordings give: 2 since looks are drawn each into its own framebuffer, and x264 follows
 #: from the pictures alone. A set of an earlier one is not continued.
 REVISION: Final = 2
+#: Packages whose version changes the bytes of a set, beside those of its format.
 _PACKAGES: Final = ("iris-session", "mujoco", "numpy", "pillow")
 #: Finished episodes that wait for an earlier one, per process.
 _AHEAD: Final = 2

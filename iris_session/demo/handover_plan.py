@@ -175,6 +175,8 @@ class _Planner:
 
     def plan(self) -> HandoverPlan:
         """Return the plan. Raises `ConfigError` with one line."""
+        for name in self._names:
+            self._scene.check_grip(name)
         given = self._find_given_grasps()
         takes: dict[PoseTuple, Floats | None] = {}
         gives: dict[tuple[int, PoseTuple], Floats | None] = {}

@@ -29,6 +29,7 @@ from iris_session.physics.tip import Tip
 from iris_session.physics.tree import KinematicTree
 from iris_session.protocol.common import Vec3
 from iris_session.protocol.specs import ObjectSpec, RobotSpec
+from iris_session.session.errors import ConfigError
 
 Floats = NDArray[np.float64]
 
@@ -231,16 +232,20 @@ class PlanningScene:
         T_world_box = (_to_vector(p), _to_quat(quat))
         return compose(inverse(_read_pose(self._data, body)), T_world_box), _to_vector(half)
 
-    def find_weak_motor(self, name: str, q: Floats) -> str:
-        """Return what motors cannot hold: an arm at joint positions, or its gripper the object; empty: nothing."""
-        model, gripper, arm = self._model, self.grippers[name], self.arms[name]
+    def check_grip(self, name: str) -> None:
+        """Raise `ConfigError` if the motors of a gripper are too weak for the object."""
+        gripper = self.grippers[name]
         geoms = [*gripper.sides, *np.flatnonzero(self._owner == OBJECT)]
-        friction = 2.0 * float(model.geom_friction[geoms, 0].max()) * gripper.force
+        friction = 2.0 * float(self._model.geom_friction[geoms, 0].max()) * gripper.force
         if friction < self._weight:
-            return (
+            raise ConfigError(
                 f"the gripper of '{name}' presses with {gripper.force:.2g} N and holds {friction:.2g} N by friction, "
-                f"but it weighs {self._weight:.2g} N"
+                f"but the object weighs {self._weight:.2g} N"
             )
+
+    def find_weak_motor(self, name: str, q: Floats) -> str:
+        """Return which motor cannot hold an arm at joint positions; empty: none."""
+        model, arm = self._model, self.arms[name]
         data = mujoco.MjData(model)
         data.qpos[:] = self._qpos
         data.qpos[arm.addresses] = q

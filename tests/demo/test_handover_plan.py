@@ -133,7 +133,7 @@ def test_arm_with_few_joints_lacks_turn_and_not_reach() -> None:
 
 def test_motors_that_cannot_hold_are_refused() -> None:
     with pytest.raises(
-        ConfigError, match=r"the gripper of 'left' presses with 0.1 N and holds .* N by friction, but it weighs"
+        ConfigError, match=r"the gripper of 'left' presses with 0.1 N and holds .* N by friction, but the object weighs"
     ):
         plan(use_motors(make_scene(6), "finger", 0.1))
     with pytest.raises(

@@ -87,7 +87,7 @@ test.each([
   expect(findOffer(state, "left")).toEqual(offer);
 });
 
-test("a holder of a robot, or of a place in a queue, cannot wait for another robot, and is told so", () => {
+test("a holder of a robot, or of a place in a queue, cannot wait for another robot, and the panel says why", () => {
   saySession([{ target: "left", holder: "p2" }, { target: "right", holder: "p1" }]);
   expect(findOffer(state, "left")).toEqual({ take: "", waits: false, none: "Release right to wait for it." });
   saySession([{ target: "left", holder: "p2" }, { target: "right", holder: "p3", queue: ["p1"] }]);
