@@ -49,9 +49,14 @@ import iris_session.session.session  # has the class itself
 from iris_session import authority
 from iris_session.cli.main import main
 from iris_session.link import front_process
+from iris_session.recording import supervise
+from iris_session.session import processes
 
 long_ns = 60 * 1_000_000_000
-front_process.HANGING_NS = front_process.STARVED_NS = long_ns
+front_process.HANGING_NS = front_process.STARVED_NS = supervise.HANGING_NS = long_ns
+processes.FrontConfig = functools.partial(
+    processes.FrontConfig, heartbeat_ns=long_ns // 6, silence_ns=long_ns, stall_ns=long_ns
+)
 authority.AuthorityConfig = functools.partial(
     authority.AuthorityConfig, freshness_ns=long_ns, gap_ns=long_ns, heartbeat_timeout_ns=long_ns
 )
