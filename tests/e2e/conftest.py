@@ -21,6 +21,7 @@ from tests.e2e.session_process import (
     COMMAND,
     DEADLINE_S,
     END_WITH_PARENT,
+    PATIENCE,
     SessionProcess,
     kill_all,
     make_serve_command,
@@ -93,8 +94,8 @@ def marked_scenario(serve: Callable[..., SessionProcess], tmp_path: Path) -> Ite
 
 @pytest.fixture
 def script_scenario(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Scenario]:
-    """The session of the script `SCRIPT` of the test's module."""
-    (tmp_path / "script.py").write_text(request.module.SCRIPT)
+    """The session of the script `SCRIPT` of the test's module, with `PATIENCE`."""
+    (tmp_path / "script.py").write_text(PATIENCE + request.module.SCRIPT)
     server = SessionProcess(tmp_path, tmp_path / "session.rrd", [sys.executable, str(tmp_path / "script.py")])
     scenario = Scenario(server)
     yield scenario

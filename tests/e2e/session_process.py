@@ -38,16 +38,12 @@ DEMO_S: Final = 900.0
 #: recorded takes as long again.
 DEMO_OPTIONS: Final = ("--json", "--timeout", "360")
 COMMAND: Final = [sys.executable, "-m", "iris_session.cli.main"]
-#: The command with limits of time that a machine which stands still for seconds does not reach: no robot holds and no
-#: participant leaves because other programs compute. What happens at these limits is tested in simulated time.
-PATIENT_COMMAND: Final = [
-    sys.executable,
-    "-c",
-    """
-import functools, sys
+#: Limits of time that a machine which stands still for seconds does not reach: no robot holds and no participant leaves
+#: because other programs compute. What happens at these limits is tested in simulated time.
+PATIENCE: Final = """
+import functools
 import iris_session.session.session  # has the class itself
 from iris_session import authority
-from iris_session.cli.main import main
 from iris_session.link import front_process
 from iris_session.recording import supervise
 from iris_session.session import processes
@@ -60,6 +56,15 @@ processes.FrontConfig = functools.partial(
 authority.AuthorityConfig = functools.partial(
     authority.AuthorityConfig, freshness_ns=long_ns, gap_ns=long_ns, heartbeat_timeout_ns=long_ns
 )
+"""
+PATIENT_COMMAND: Final = [
+    sys.executable,
+    "-c",
+    f"""
+import sys
+{PATIENCE}
+from iris_session.cli.main import main
+
 sys.exit(main())
 """,
 ]

@@ -15,14 +15,15 @@ SCRIPT = """
 import time
 from pathlib import Path
 import mujoco
-from iris_session import AuthorityConfig, Session, SessionConfig
+from iris_session import Session, SessionConfig, authority
 from iris_session.demo.scenes import scene_path
 
 model = mujoco.MjModel.from_xml_path(str(scene_path("handover")))
 data = mujoco.MjData(model)
 mujoco.mj_resetDataKeyframe(model, data, 0)
-patient = AuthorityConfig(freshness_ns=10**11, gap_ns=10**11, heartbeat_timeout_ns=10**11)  # others may compute
-config = SessionConfig(name="mine", control_port=0, state_port=0, record="session.rrd", authority=patient)
+config = SessionConfig(
+    name="mine", control_port=0, state_port=0, record="session.rrd", authority=authority.AuthorityConfig()
+)
 session = Session.attach(model, data, config)
 print(f"session on {session.address}, recording to {session.recording}", flush=True)
 while not Path("end").exists():

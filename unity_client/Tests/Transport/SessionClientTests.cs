@@ -327,7 +327,7 @@ namespace IrisSession.Transport.Tests
                     bool hasEnded = client.Stop();
                     // `Stop` gives up after less than a second; on a machine that stood still meanwhile the threads need their time.
                     WaitUntil(() => hasEnded || client.HasEnded, "the thread of the session is left");
-                    Assert.IsTrue(transport.HasEnded, "a thread of a socket is left");
+                    WaitUntil(() => transport.HasEnded, "a thread of a socket is left");
                     Assert.AreEqual("", client.Crash);
                 }
             }

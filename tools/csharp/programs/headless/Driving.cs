@@ -11,9 +11,13 @@ internal sealed class Driving
     private const double MoveS = 2.0;
     private const double SettledM = 0.002;
     private const double ArrivedM = 0.005;
+    /// <summary>The controller stands still while this process does: a hand that is far away afterwards would be a jump.</summary>
+    private const double LongestStepS = 0.05;
 
     private readonly Headset headset;
     private readonly Report report;
+    private double movedS;
+    private long lastMovedNs;
 
     public Driving(Headset headset, Report report)
     {
@@ -26,11 +30,11 @@ internal sealed class Driving
     {
         if (!Begin("move", robot, out RigidTransform before)) return false;
         RigidTransform from = headset.T_world_controller;
-        long beganNs = MonotonicClock.NowNs;
+        BeginWay();
         double error = double.NaN;
         bool isSettled = headset.RunUntil(() =>
         {
-            double share = MoveController(from, by, beganNs);
+            double share = MoveController(from, by);
             if (share < 1.0 || !headset.TryGetSite(robot, out RigidTransform after)) return false;
             error = (after.Position - before.Position - by).Length;
             return error < SettledM;
@@ -45,26 +49,35 @@ internal sealed class Driving
     {
         if (!Begin("touch", robot, out RigidTransform before)) return false;
         RigidTransform from = headset.T_world_controller;
-        long beganNs = MonotonicClock.NowNs;
+        BeginWay();
         headset.ContactPulse = default;
         double contact = 0.0;
         bool isFelt = headset.RunUntil(() =>
         {
-            MoveController(from, by, beganNs);
+            MoveController(from, by);
             if (headset.Pulses.Find(robot) is Feedback now) contact = now.ContactN;
             return contact > 0.0 && headset.ContactPulse.IsFelt;
         }, 30.0);
         RigidTransform pressed = headset.T_world_controller;
-        beganNs = MonotonicClock.NowNs;
-        headset.RunUntil(() => MoveController(pressed, from.Position - pressed.Position, beganNs) >= 1.0);
+        BeginWay();
+        headset.RunUntil(() => MoveController(pressed, from.Position - pressed.Position) >= 1.0);
         End("touch", robot, isFelt, before, "contact_n", contact, "pulse", (double)headset.ContactPulse.Intensity);
         return isFelt;
     }
 
-    /// <summary>Move the controller from rest to rest. Returns the share of the way.</summary>
-    private double MoveController(RigidTransform from, Double3 by, long beganNs)
+    private void BeginWay()
     {
-        double share = Math.Min(1.0, (MonotonicClock.NowNs - beganNs) * 1e-9 / MoveS);
+        movedS = 0.0;
+        lastMovedNs = MonotonicClock.NowNs;
+    }
+
+    /// <summary>Move the controller on, from rest to rest. Returns the share of the way.</summary>
+    private double MoveController(RigidTransform from, Double3 by)
+    {
+        long nowNs = MonotonicClock.NowNs;
+        movedS += Math.Min((nowNs - lastMovedNs) * 1e-9, LongestStepS);
+        lastMovedNs = nowNs;
+        double share = Math.Min(1.0, movedS / MoveS);
         headset.T_world_controller = new RigidTransform(from.Position + share * share * (3.0 - 2.0 * share) * by, from.Rotation);
         return share;
     }
