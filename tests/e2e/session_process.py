@@ -38,12 +38,14 @@ DEMO_S: Final = 900.0
 #: recorded takes as long again.
 DEMO_OPTIONS: Final = ("--json", "--timeout", "360")
 COMMAND: Final = [sys.executable, "-m", "iris_session.cli.main"]
-#: Limits of time that a machine which stands still for seconds does not reach: no robot holds and no participant leaves
-#: because other programs compute. What happens at these limits is tested in simulated time.
+#: Limits of time that a machine which stands still for seconds does not reach: no robot holds, no participant leaves
+#: and no hand jumps because other programs compute. What happens at these limits is tested in simulated time.
 PATIENCE: Final = """
 import functools
+from msgspec import structs
 import iris_session.session.session  # has the class itself
 from iris_session import authority
+from iris_session.authority import config
 from iris_session.link import front_process
 from iris_session.recording import supervise
 from iris_session.session import processes
@@ -53,8 +55,9 @@ front_process.HANGING_NS = front_process.STARVED_NS = supervise.HANGING_NS = lon
 processes.FrontConfig = functools.partial(
     processes.FrontConfig, heartbeat_ns=long_ns // 6, silence_ns=long_ns, stall_ns=long_ns
 )
+far = {device: structs.replace(one, noise_m=1.0, noise_rad=3.0) for device, one in config.SPEED_LIMITS.items()}
 authority.AuthorityConfig = functools.partial(
-    authority.AuthorityConfig, freshness_ns=long_ns, gap_ns=long_ns, heartbeat_timeout_ns=long_ns
+    authority.AuthorityConfig, freshness_ns=long_ns, gap_ns=long_ns, heartbeat_timeout_ns=long_ns, speed_limits=far
 )
 """
 PATIENT_COMMAND: Final = [
