@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import re
+import socket
 import sys
 from contextlib import redirect_stdout
 from functools import partial
 from typing import Final
 
 from iris_session.cli.common import (
+    CONNECT_S,
     CommandError,
     ending_as_interrupts,
     is_given,
@@ -63,6 +66,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--ray", metavar="ADDRESS", help=text)
 
 
+def check_cluster_reachable(address: str) -> None:
+    """Raise `CommandError` within `CONNECT_S` if nothing listens at a given address: Ray would try for minutes."""
+    if (at := re.fullmatch(r"(?:ray://)?\[?([^/]+?)\]?:(\d{1,5})", address)) is None:
+        return  # `local`, `auto`
+    try:
+        socket.create_connection((at[1], int(at[2])), CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise CommandError(
+            f"no Ray cluster answers at {address}: `ray start --head` prints its address ({error})"
+        ) from None
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Write the data set, and print what it holds."""
     from iris_session.system.extras import require_package
@@ -71,6 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
         require_package(package, f"--to {arguments.to}")
     if arguments.ray:
         require_package("ray", "--ray")
+        check_cluster_reachable(arguments.ray)
     from iris_session.dataset.cameras import PictureSpec, parse_cameras
     from iris_session.dataset.episodes import PlanOptions, list_files
     from iris_session.dataset.ray_pool import RayPool

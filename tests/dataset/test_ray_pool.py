@@ -7,6 +7,7 @@ import importlib.util
 import os
 import pickle
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -23,7 +24,9 @@ import msgspec
 import psutil
 import pytest
 
+from iris_session.cli.common import CommandError
 from iris_session.cli.main import main
+from iris_session.cli.recording_dataset import check_cluster_reachable
 from iris_session.dataset import ray_pool
 from iris_session.dataset.cameras import PictureSpec, parse_cameras
 from iris_session.dataset.episodes import DatasetError, PlanOptions
@@ -213,6 +216,17 @@ def test_a_node_without_the_package_is_named_and_a_defect_is_not_hidden(
 def test_no_cluster_is_one_line(played: Played, tmp_path: Path, ray: StandIn) -> None:
     with pytest.raises(DatasetError, match=r"^no Ray cluster can be used at 'nowhere': nothing listens there$"):
         export_dataset([played.path], tmp_path / "set", "lerobot", open_pool=partial(RayPool, "nowhere", None))
+
+
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_an_address_where_nothing_listens_is_refused_at_once(scheme: str) -> None:
+    """Ray would try for minutes."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"{scheme}127.0.0.1:{server.getsockname()[1]}"
+        check_cluster_reachable(address)
+    with pytest.raises(CommandError, match=f"^no Ray cluster answers at {address}: "):
+        check_cluster_reachable(address)
+    check_cluster_reachable("auto")
 
 
 def test_a_missing_package_is_named(

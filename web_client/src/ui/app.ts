@@ -33,6 +33,8 @@ import { makeWelcome } from "./welcome.ts";
 import { type HeadsetControls, makeHeadsetControls } from "../xr/controls.ts";
 
 const STATUS_PERIOD_MS = 1000;
+/** Between the tools and what lies below them. */
+const TOOLS_GAP_PX = 10;
 const NOTICE_MS = 8000;
 /** What tests and the console may look at. */
 export interface PageHandle {
@@ -58,6 +60,8 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
   const pairing = makePairing(client, baseUrl, () => joining.name, (name, roles) => joining.joinPaired(name, roles));
 
   const stage = makeStage(state, { pair: () => pairing.open("", ""), retry: () => joining.join() });
+  const measureTools = (): number => stage.tools.offsetTop + stage.tools.offsetHeight;
+  new ResizeObserver(() => stage.element.style.setProperty("--tools-end", `${measureTools() + TOOLS_GAP_PX}px`)).observe(stage.tools);
   const handle: PageHandle = { state, view: null, gizmo: null, headset: null };
   try {
     handle.view = new View(stage.canvas, client, {
@@ -66,7 +70,7 @@ export function startPage(root: HTMLElement, client: WorkerClient): PageHandle {
         state.touch();
       },
       onProblem: (text) => state.note(text, "warning"),
-      measureTop: () => stage.tools.offsetTop + stage.tools.offsetHeight,
+      measureTop: measureTools,
     });
     stage.setView(handle.view, "");
   } catch (error) {

@@ -56,18 +56,36 @@ export function episodeAdvice(now: EpisodeNow | null, now_ns: number, leader: st
 }
 
 /** Return the lines of a board: the task, the episode, what to do. None without an episode and a task. */
-export function describeEpisode(now: EpisodeNow | null, now_ns: number, leader: string): string[] {
+export function describeEpisode(state: PageState): string[] {
+  const now = state.session?.episode ?? null;
   if (now === null) return [];
-  const advice = episodeAdvice(now, now_ns, leader);
+  const advice = adviseOnEpisode(state);
   return [now.instruction || now.task, `${episodeTitle(now)}${advice ? `: ${advice}` : ""}`].filter((line) => line !== "");
 }
 
+/** Return `episodeAdvice` for this page, and between episodes what keeps it from starting the next one. */
+export function adviseOnEpisode(state: PageState): string {
+  const now = state.session?.episode ?? null;
+  const advice = episodeAdvice(now, state.sessionTime(), now?.led_by ? state.nameOf(now.led_by) : "");
+  if (!isEpisodeOver(now) || !mayAct(state) || mayBegin(state)) return advice;
+  const robots = listTaskRobots(state);
+  const which = robots.length > 2 ? `one of ${robots.join(", ")}` : robots.join(" or ");
+  return [advice, `take ${which} to start`].filter((one) => one !== "").join("; ");
+}
+
+/** Return whether the role of this page starts and ends episodes. */
+const mayAct = (state: PageState): boolean => state.isReady && EPISODE_ROLES.includes(state.role);
+
 /** Return whether the session lets this page start an episode or reset the scene: directors and holders of a robot of the task. */
 export function mayBegin(state: PageState): boolean {
-  const wanted = state.welcome?.task_robots ?? [];
-  const robots = (state.session?.robots ?? []).map(({ name }) => name).filter((name) => wanted.length === 0 || wanted.includes(name));
+  const robots = listTaskRobots(state);
   const held = state.heldBy(state.selfId);
   return state.isDirector || robots.length === 0 || robots.some((name) => held.includes(name));
+}
+
+function listTaskRobots(state: PageState): string[] {
+  const wanted = state.welcome?.task_robots ?? [];
+  return (state.session?.robots ?? []).map(({ name }) => name).filter((name) => wanted.length === 0 || wanted.includes(name));
 }
 
 export interface EpisodeStrip {
@@ -107,14 +125,13 @@ export function makeEpisodeStrip(state: PageState, actions: Actions): EpisodeStr
   const extra = h("div", { class: "controls" }, begin, reset);
   const field = h("div", { class: "controls" }, h("label", { for: "episode-label", class: "hidden-text" }, "Label of the episode"), label);
   const section = makeSection("episodes", "Episodes", h("div", {}, now, field, extra));
-  const mayAct = (): boolean => state.isReady && EPISODE_ROLES.includes(state.role);
   let timer = 0;
 
   window.addEventListener("keydown", (event) => {
     const isTyped = event.target instanceof HTMLElement && event.target.closest("input, select, textarea, dialog") !== null;
     const key = KEYS[event.code];
     const episode = state.session?.episode ?? null;
-    if (key === undefined || isTyped || event.repeat || event.ctrlKey || event.metaKey || event.altKey || event.shiftKey || !mayAct() || strip.hidden) return;
+    if (key === undefined || isTyped || event.repeat || event.ctrlKey || event.metaKey || event.altKey || event.shiftKey || !mayAct(state) || strip.hidden) return;
     const isOver = isEpisodeOver(episode);
     if (!isOver) send(key === "begin" ? "success" : key);
     else if (key === "begin" && mayBegin(state)) send("start");
@@ -122,8 +139,6 @@ export function makeEpisodeStrip(state: PageState, actions: Actions): EpisodeStr
 
   const update = (): void => {
     const episode = state.session?.episode ?? null;
-    const leader = episode?.led_by ? state.nameOf(episode.led_by) : "";
-    const now_ns = state.sessionTime();
     const [isOver, isRecorded] = [isEpisodeOver(episode), RECORDED.includes(episode?.state ?? "")];
     const isAwaited = episode?.state === "closing" && episode.verdict === "";
     // Without a task the strip is there from the first episode on.
@@ -131,14 +146,14 @@ export function makeEpisodeStrip(state: PageState, actions: Actions): EpisodeStr
     strip.classList.toggle("running", isRecorded);
     setText(task, episode?.instruction || episode?.task || "");
     task.hidden = task.textContent === "";
-    setText(title, episodeTitle(episode));
-    setText(advice, episodeAdvice(episode, now_ns, leader));
-    const left = secondsLeft(episode, now_ns);
+    setText(advice, adviseOnEpisode(state));
+    setText(title, `${episodeTitle(episode)}${isOver && advice.textContent ? ":" : ""}`);
+    const left = secondsLeft(episode, state.sessionTime());
     countdown.hidden = episode?.state !== "countdown" || left === 0;
     setText(countdown, String(left));
     setText(now, episode?.label ? `${episodeTitle(episode)} (${episode.label})` : episodeTitle(episode));
     now.classList.toggle("running", isRecorded);
-    field.hidden = controls.hidden = extra.hidden = !mayAct();
+    field.hidden = controls.hidden = extra.hidden = !mayAct(state);
     const hasLeft = episode?.state === "left";
     start.hidden = reset.hidden = !isOver || !mayBegin(state);
     begin.hidden = episode !== null || !mayBegin(state);

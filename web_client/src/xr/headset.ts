@@ -337,7 +337,7 @@ export class Headset {
       notice: performance.now() < this.notice.until_ms ? this.notice.text : "",
     });
     const episode = session?.episode ?? null;
-    const lines = describeEpisode(episode, state.sessionTime(), episode?.led_by ? state.nameOf(episode.led_by) : "").flatMap(wrap);
+    const lines = describeEpisode(state).flatMap(wrap);
     this.props.urgent.setText([...urgent, ...steps, ...(isUrgent(episode) ? lines : [])], URGENT_COLOR);
     const driven = [...this.hands.driven].map(([side, robot]) => `${side} hand: ${robot}`);
     const color = participantColor(state.selfId);

@@ -23,6 +23,14 @@ const NOW: EpisodeNow = {
   robots: [],
 };
 
+/** Return the state of the page of ann, p1, who holds a robot. */
+function makeState(role: string, held: string, task_robots: string[], robots: string[], episode: EpisodeNow | null): PageState {
+  const state = new PageState({ on: () => undefined } as unknown as ConstructorParameters<typeof PageState>[0]);
+  const leases = [{ target: held, holder: "p1", sub_holders: [] }];
+  const session = { participant_id: "p1", participants: [{ id: "p1", name: "ann", role }], leases, robots: robots.map((name) => ({ name })), episode };
+  return Object.assign(state, { session, welcome: { task_robots }, phase: { phase: "ready" } }) as PageState;
+}
+
 describe("words", () => {
   test("a countdown is in whole seconds, and none before the clock is known", () => {
     expect([1, 1e9, 2.01e9, 3e9, 4e9].map((ns) => secondsLeft(NOW, ns))).toEqual([3, 2, 1, 0, 0]);
@@ -31,9 +39,18 @@ describe("words", () => {
   });
 
   test("the board has the task, how far it is, and what to do", () => {
-    expect(describeEpisode(NOW, 1e9, "ann")).toEqual(["Pour the cup.", "Episode 13, 12 of 50: begins in 2"]);
-    expect(describeEpisode({ ...NOW, state: "idle", number: 12 }, 1, "")).toEqual(["Pour the cup.", "12 episodes so far, 12 of 50"]);
-    expect(describeEpisode(null, 1, "")).toEqual([]);
+    const describe = (episode: EpisodeNow | null, held = "left", role = "operator", robots = ["left", "right"]): string[] => {
+      const state = makeState(role, held, [], robots, episode);
+      vi.spyOn(state, "sessionTime").mockReturnValue(1e9);
+      return describeEpisode(state);
+    };
+    const idle = { ...NOW, state: "idle", number: 12 };
+    expect(describe(NOW)).toEqual(["Pour the cup.", "Episode 13, 12 of 50: begins in 2"]);
+    expect(describe(idle)).toEqual(["Pour the cup.", "12 episodes so far, 12 of 50"]);
+    expect(describe(idle, "", "observer")).toEqual(describe(idle));
+    expect(describe(idle, "")[1]).toBe("12 episodes so far, 12 of 50: take left or right to start");
+    expect(describe({ ...NOW, state: "success" }, "", "operator", ["a", "b", "c"])[1]).toBe("Episode 13, 12 of 50: success; take one of a, b, c to start");
+    expect(describe(null)).toEqual([]);
     expect(episodeTitle({ ...NOW, wanted: 0 })).toBe("Episode 13");
   });
 
@@ -68,10 +85,7 @@ describe("offers", () => {
     vi.stubGlobal("HTMLElement", class {});
     vi.stubGlobal("document", { createElement });
     vi.stubGlobal("window", { addEventListener: (_type: string, listener: typeof press) => (press = listener) });
-    const state = new PageState({ on: () => undefined } as unknown as ConstructorParameters<typeof PageState>[0]);
-    const leases = [{ target: held, holder: "p1", sub_holders: [] }];
-    const session = { participant_id: "p1", participants: [{ id: "p1", name: "ann", role }], leases, robots: robots.map((name) => ({ name })), episode: { ...NOW, state: "success" } };
-    Object.assign(state, { session, welcome: { task_robots }, phase: { phase: "ready" } });
+    const state = makeState(role, held, task_robots, robots, { ...NOW, state: "success" });
     const sent: string[] = [];
     const request = async ({ action }: { action: string }): Promise<boolean> => sent.push(action) > 0;
     const strip = makeEpisodeStrip(state, { request } as unknown as Parameters<typeof makeEpisodeStrip>[1]);
