@@ -34,8 +34,6 @@ MAX_GROWTH_MIB: Final = 64
 WARM_UP: Final = 5000
 MEASURE_EVERY: Final = 1000
 MAX_FINDINGS: Final = 5
-
-
 #: Returns free memory of this process to the system, where the C library can.
 trim_memory: Final = getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)
 

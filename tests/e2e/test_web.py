@@ -400,6 +400,11 @@ def test_a_tab_in_the_background_keeps_its_robot(scenario: Scenario, open_page: 
     known = len(scenario.events["watcher"])
     with ThreadPoolExecutor(1) as thread:
         still = thread.submit(page.stand_still, BACKGROUND_S)
+        scenario.run_for(0.8 * BACKGROUND_S)
+        report = watcher.status()
+        assert not still.done()
+        heard_ns = next(one.heard_ns for one in report.participants if one.id == dan)
+        assert 0 <= heard_ns < 0.4e9 * BACKGROUND_S, "the worker goes on sending"
         scenario.run_until(still.done, "the tab is in front again", BACKGROUND_S + DEADLINE_S)
         still.result()
     assert [one for one in scenario.events["watcher"][known:] if not is_of_the_machine(one, watcher.name)] == []
